@@ -1,0 +1,198 @@
+"""SE(3), projection, back-projection and pose errors. Arrays in, arrays out; float64 unless said otherwise."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from semdb.types import Camera, Float32Array, FloatArray
+
+
+def project_to_so3(matrix: npt.ArrayLike) -> FloatArray:
+    """The rotation nearest to `matrix` ``[3, 3]`` in the Frobenius norm (polar decomposition by SVD).
+
+    Raises ValueError when `matrix` is not finite or is nearer to a reflection than to a rotation.
+    """
+    m = np.asarray(matrix, dtype=np.float64)
+    if m.shape != (3, 3) or not np.isfinite(m).all():
+        raise ValueError("not a finite 3x3 matrix")
+    if np.linalg.det(m) <= 0:
+        raise ValueError("not a rotation: its determinant is not positive")
+    u, _, vt = np.linalg.svd(m)
+    rotation: FloatArray = u @ vt
+    return rotation
+
+
+def pose_from(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> FloatArray:
+    """A 4x4 pose of `rotation` ``[3, 3]`` and `translation` ``[3]`` metres."""
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = translation
+    return pose
+
+
+def invert_pose(pose: FloatArray) -> FloatArray:
+    """The inverse of a rigid ``[4, 4]`` pose, exactly rigid again."""
+    rotation = pose[:3, :3].T
+    return pose_from(rotation, -rotation @ pose[:3, 3])
+
+
+def transform_points(pose: FloatArray, points: npt.ArrayLike) -> FloatArray:
+    """`points` ``[..., 3]`` moved by `pose` ``[4, 4]``."""
+    moved: FloatArray = np.asarray(points, dtype=np.float64) @ pose[:3, :3].T + pose[:3, 3]
+    return moved
+
+
+def quat_wxyz_from_rotation(rotation: FloatArray) -> FloatArray:
+    """Unit quaternion ``[4]`` (w, x, y, z), w >= 0, of a rotation ``[3, 3]`` (Shepperd's method)."""
+    m = rotation
+    trace = float(np.trace(m))
+    candidates = np.array([trace, m[0, 0], m[1, 1], m[2, 2]])
+    largest = int(np.argmax(candidates))
+    if largest == 0:
+        q = np.array([1 + trace, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
+    else:
+        i = largest - 1
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q = np.empty(4)
+        q[0] = m[k, j] - m[j, k]
+        q[1 + i] = 1 + m[i, i] - m[j, j] - m[k, k]
+        q[1 + j] = m[j, i] + m[i, j]
+        q[1 + k] = m[k, i] + m[i, k]
+    q /= np.linalg.norm(q)
+    return q if q[0] >= 0 else -q
+
+
+def rotation_from_quat_wxyz(quat_wxyz: npt.ArrayLike) -> FloatArray:
+    """Rotation ``[3, 3]`` of a quaternion ``[4]`` (w, x, y, z) of any length but zero. Raises ValueError."""
+    q = np.asarray(quat_wxyz, dtype=np.float64)
+    norm = float(np.linalg.norm(q))
+    if q.shape != (4,) or not np.isfinite(norm) or norm < 1e-12:
+        raise ValueError("not a quaternion: four finite numbers, not all zero, are needed")
+    w, x, y, z = q / norm
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def slerp_wxyz(first: FloatArray, second: FloatArray, fraction: float) -> FloatArray:
+    """Spherical interpolation between two unit quaternions ``[4]``, the short way round."""
+    dot = float(first @ second)
+    if dot < 0:
+        second, dot = -second, -dot
+    angle = float(np.arctan2(np.linalg.norm(second - dot * first), dot))
+    if angle < 1e-9:
+        mixed = (1 - fraction) * first + fraction * second
+    else:
+        mixed = (np.sin((1 - fraction) * angle) * first + np.sin(fraction * angle) * second) / np.sin(angle)
+    result: FloatArray = mixed / np.linalg.norm(mixed)
+    return result
+
+
+def interpolate_pose(first: FloatArray, second: FloatArray, fraction: float) -> FloatArray:
+    """The pose at `fraction` 0..1 between two ``[4, 4]`` poses: slerp of rotation, linear translation."""
+    quaternion = slerp_wxyz(quat_wxyz_from_rotation(first[:3, :3]), quat_wxyz_from_rotation(second[:3, :3]), fraction)
+    translation = (1 - fraction) * first[:3, 3] + fraction * second[:3, 3]
+    return pose_from(rotation_from_quat_wxyz(quaternion), translation)
+
+
+def skew(v: FloatArray) -> FloatArray:
+    """``skew(v) @ u == cross(v, u)``."""
+    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+
+
+def so3_exp(omega: npt.ArrayLike) -> FloatArray:
+    """Rotation ``[3, 3]`` of a rotation vector ``[3]`` in radians (Rodrigues)."""
+    w = np.asarray(omega, dtype=np.float64)
+    angle = float(np.linalg.norm(w))
+    k = skew(w)
+    if angle < 1e-8:
+        return np.asarray(np.eye(3) + k + 0.5 * k @ k)
+    a, b = np.sin(angle) / angle, (1 - np.cos(angle)) / (angle * angle)
+    return np.asarray(np.eye(3) + a * k + b * k @ k)
+
+
+def rotation_angle_deg(rotation: FloatArray) -> float:
+    """Angle of a rotation in degrees by atan2, exact near 0 and near 180."""
+    q = quat_wxyz_from_rotation(rotation)
+    return float(np.degrees(2 * np.arctan2(np.linalg.norm(q[1:]), q[0])))
+
+
+def pose_error(estimate: FloatArray, truth: FloatArray) -> tuple[float, float]:
+    """Distance in metres and angle in degrees between two ``[4, 4]`` poses."""
+    distance = float(np.linalg.norm(estimate[:3, 3] - truth[:3, 3]))
+    return distance, rotation_angle_deg(estimate[:3, :3].T @ truth[:3, :3])
+
+
+def project(camera: Camera, points: npt.ArrayLike) -> FloatArray:
+    """Pixels ``[n, 2]`` (with distortion) of camera-frame `points` ``[n, 3]`` metres; NaN at or behind z = 0."""
+    p = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        xy = np.where(p[:, 2:] > 0, p[:, :2] / p[:, 2:], np.nan)
+    return normalized_to_pixels(camera, xy)
+
+
+def _distort(
+    coefficients: tuple[float, ...], x: FloatArray, y: FloatArray
+) -> tuple[FloatArray, FloatArray, tuple[FloatArray, FloatArray, FloatArray]]:
+    """Distorted coordinates and their Jacobian (dxx, dxy = dyx, dyy), each ``[n]``."""
+    k1, k2, p1, p2, k3 = (*coefficients, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # d radial / d x = slope * x
+    xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    dxx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
+    dxy = slope * x * y + 2 * p1 * x + 2 * p2 * y
+    dyy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+    return xd, yd, (dxx, dxy, dyy)
+
+
+def normalized_to_pixels(camera: Camera, xy: FloatArray) -> FloatArray:
+    """Pixels ``[n, 2]`` of undistorted normalised coordinates ``[n, 2]`` (OpenCV's distortion model)."""
+    x, y = xy[:, 0], xy[:, 1]
+    if any(camera.distortion):
+        x, y, _ = _distort(camera.distortion, x, y)
+    return np.stack([camera.fx * x + camera.cx, camera.fy * y + camera.cy], axis=1)
+
+
+def pixels_to_normalized(camera: Camera, pixels: npt.ArrayLike) -> FloatArray:
+    """Undistorted normalised coordinates ``[n, 2]`` of `pixels` ``[n, 2]`` as seen, by Newton's method.
+
+    NaN where the distortion model cannot be inverted (outside the image of a strongly distorted lens).
+    """
+    p = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+    target_x, target_y = (p[:, 0] - camera.cx) / camera.fx, (p[:, 1] - camera.cy) / camera.fy
+    if not any(camera.distortion):
+        return np.stack([target_x, target_y], axis=1)
+    x, y = target_x.copy(), target_y.copy()
+    for _ in range(20):
+        xd, yd, (dxx, dxy, dyy) = _distort(camera.distortion, x, y)
+        ex, ey = xd - target_x, yd - target_y
+        if len(p) == 0 or max(np.abs(ex).max(), np.abs(ey).max()) < 1e-12:
+            break
+        with np.errstate(divide="ignore", invalid="ignore"):
+            determinant = dxx * dyy - dxy * dxy
+            x = x - (dyy * ex - dxy * ey) / determinant
+            y = y - (dxx * ey - dxy * ex) / determinant
+    xd, yd, _ = _distort(camera.distortion, x, y)
+    bad = ~(np.hypot(xd - target_x, yd - target_y) < 1e-6)
+    return np.where(bad[:, None], np.nan, np.stack([x, y], axis=1))
+
+
+def back_project(camera: Camera, pixels: npt.ArrayLike, depth: npt.ArrayLike) -> FloatArray:
+    """Camera-frame points ``[n, 3]`` of `pixels` ``[n, 2]`` as seen at `depth` ``[n]`` metres (z, not range)."""
+    z = np.asarray(depth, dtype=np.float64)
+    return np.column_stack([pixels_to_normalized(camera, pixels) * z[:, None], z])
+
+
+def depth_to_points(camera: Camera, depth: Float32Array, step: int = 1) -> FloatArray:
+    """Valid points ``[n, 3]`` in the camera frame of every `step`-th pixel of a depth image ``[H, W]``."""
+    v, u = np.mgrid[step // 2 : depth.shape[0] : step, step // 2 : depth.shape[1] : step]
+    z = depth[v, u].ravel()
+    valid = np.isfinite(z) & (z > 0)
+    return back_project(camera, np.column_stack([u.ravel(), v.ravel()])[valid], z[valid])

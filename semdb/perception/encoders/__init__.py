@@ -1,0 +1,1 @@
+"""semdb.perception.encoders"""

@@ -1,0 +1,32 @@
+"""One typed settings object. Every field is an environment variable with the prefix ``SEMDB_``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import Field
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+
+class Settings(BaseSettings):
+    """Settings of semdb. Options of commands override them; they override the defaults here."""
+
+    model_config = SettingsConfigDict(env_prefix="SEMDB_", extra="ignore")
+
+    database_url: str = Field(
+        "sqlite:///semdb.sqlite3", description="sqlite:///FILE or mysql+pymysql://USER:PASSWORD@HOST/SCHEMA"
+    )
+    reader_url: str | None = Field(None, description="SELECT-only account that `semdb sql` uses on a server")
+    detector: str = Field(
+        "auto",
+        description="auto, onnx:FILE or recorded. auto: a query takes the map's own; an ingest takes the "
+        "recording's masks and says so",
+    )
+    encoder: str = Field("auto", description="auto, onnx:FILE or gist. auto: a query takes the map's own")
+    features: str = Field("auto", description="auto, surf, sift or orb. auto: the map's own, or surf")
+    device: str = Field("cpu", description="device of the torch models")
+    score_threshold: float = Field(0.5, ge=0.0, le=1.0, description="detections below are not kept")
+    max_keypoints: int = Field(1500, ge=50, le=20000, description="keypoints kept per image, by response")
+    threads: int = Field(2, ge=1, le=256, description="threads of one process for networks and kernels")
+    cache_dir: Path = Field(Path("~/.cache/semdb"), description="compiled kernels, pulled models and saved indexes")
+    sql_time_limit_s: float = Field(60.0, gt=0, description="time limit of `semdb sql`")
