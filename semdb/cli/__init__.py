@@ -1,1 +1,1 @@
-"""semdb.cli"""
+"""The command line: thin commands over the rest of semdb."""

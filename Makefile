@@ -1,0 +1,65 @@
+# make demo   install the base into .venv and run the demonstration (no setting, no model file needed)
+# make test   install everything, MariaDB included, then lint, types and all tests
+# make lint   ruff and mypy            make lock    write requirements/constraints.txt anew
+# make bench  all benchmarks           make wheel   dist/*.whl           make clean   remove what make made
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DELETE_ON_ERROR:
+.DEFAULT_GOAL := help
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+LOCK := requirements/constraints.txt
+PYTEST_ARGS ?=
+
+.PHONY: help demo test unit lint services lock bench wheel clean
+
+help:
+	@sed -n 's/^# //p' Makefile
+
+# An environment that exists is kept; stamps say what was installed into it from which lock.
+$(BIN)/python:
+	@scripts/make-venv.sh $(VENV)
+
+$(VENV)/.stamp-base: pyproject.toml $(LOCK) | $(BIN)/python
+	@echo "installing semdb and what it needs into $(VENV)"
+	@$(PIP) install --constraint $(LOCK) --editable .
+	@touch $@
+
+$(VENV)/.stamp-dev: pyproject.toml $(LOCK) | $(BIN)/python
+	@echo "installing semdb with the worker and development extras into $(VENV)"
+	@$(PIP) install --constraint $(LOCK) --editable '.[worker,dev]'
+	@touch $(VENV)/.stamp-base $@
+
+demo: $(VENV)/.stamp-base
+	@scripts/demo.sh $(BIN)/semdb
+
+services:
+	@scripts/install-services.sh
+
+test: $(VENV)/.stamp-dev services lint
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+unit: $(VENV)/.stamp-dev
+	$(BIN)/python -m pytest tests/unit $(PYTEST_ARGS)
+
+lint: $(VENV)/.stamp-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+lock:
+	@scripts/lock.sh $(LOCK)
+
+bench: $(VENV)/.stamp-dev
+	@for file in bench/[a-z]*.py; do \
+	  name=$$(basename "$$file" .py); mkdir -p bench-output; \
+	  echo "== bench.$$name"; $(BIN)/python -m "bench.$$name" --json "bench-output/$$name.json"; \
+	done
+
+wheel: $(VENV)/.stamp-dev
+	$(BIN)/python -m build --wheel --no-isolation --outdir dist .
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info demo-output bench-output .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,0 +1,140 @@
+"""The one entry point: commands found by name, errors turned into one line and an exit code.
+
+A command is a module of this package with a function `command` (or a `typer.Typer` of that name, for a group).
+Its module is imported when the command is called or its help is shown, so modules keep heavy imports inside
+functions; `semdb --help` must stay instant.
+"""
+
+from __future__ import annotations
+
+import errno
+import importlib
+import os
+import sys
+import traceback
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from semdb.errors import SemdbError
+
+# name -> module[:attribute], in the order of the help; the attribute is `command` unless it says otherwise
+COMMANDS: dict[str, str] = {
+    "init": "semdb.cli.init",
+    "recording": "semdb.cli.recording",
+    "ingest": "semdb.cli.ingest",
+    "status": "semdb.cli.status",
+    "retry": "semdb.cli.status:retry",
+    "delete": "semdb.cli.delete",
+    "localize": "semdb.cli.localize",
+    "evaluate": "semdb.cli.evaluate",
+    "sql": "semdb.cli.sql",
+    "keypoints": "semdb.cli.keypoints",
+    "models": "semdb.cli.models",
+    "synth": "semdb.cli.synth",
+    "doctor": "semdb.cli.doctor",
+}
+
+INTERRUPTED = 130  # 128 + SIGINT, as a shell reports it
+
+
+def load_command(name: str) -> Any:
+    """The click command (or group) registered as `name`. Raises ``KeyError`` for a name that is not registered."""
+    module_name, _, attribute = COMMANDS[name].partition(":")
+    target = getattr(importlib.import_module(module_name), attribute or "command")
+    if isinstance(target, typer.Typer):
+        group = typer.main.get_group(target)
+        group.name = name
+        return group
+    single = typer.Typer(add_completion=False, rich_markup_mode=None)
+    single.command(name)(target)
+    return typer.main.get_command(single)
+
+
+def report(error: BaseException) -> int:
+    """Print what went wrong on stderr, one line without a traceback (``SEMDB_DEBUG=1`` shows it); the exit code."""
+    if os.environ.get("SEMDB_DEBUG", "") not in {"", "0"}:
+        traceback.print_exception(error)
+    if isinstance(error, KeyboardInterrupt):
+        print("semdb: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    if isinstance(error, SemdbError):
+        print(f"semdb: {error}", file=sys.stderr)
+        return error.exit_code
+    if isinstance(error, OSError):
+        name = f"{error.filename}: " if error.filename else ""
+        print(f"semdb: {name}{error.strerror or error}", file=sys.stderr)
+        return 1
+    raise error
+
+
+class CommandGroup(TyperGroup):
+    """Loads a command when it is named, and catches the errors of all of them."""
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        # only the names matter here: typer suggests from them when a command is mistyped
+        self.commands = dict.fromkeys(COMMANDS, self)
+        self._loaded: dict[str, Any] = {}
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        if cmd_name not in COMMANDS:
+            return None
+        if cmd_name not in self._loaded:
+            self._loaded[cmd_name] = load_command(cmd_name)
+        return self._loaded[cmd_name]
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except (SemdbError, OSError, KeyboardInterrupt) as error:
+            if isinstance(error, OSError) and error.errno == errno.EPIPE:
+                raise  # the reader of a pipe went away: typer ends quietly
+            raise typer.Exit(report(error)) from None
+
+
+app = typer.Typer(
+    name="semdb",
+    cls=CommandGroup,
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _print_version(value: bool) -> None:
+    if value:
+        import semdb
+
+        print(f"semdb {semdb.__version__}")
+        raise typer.Exit(0)
+
+
+@app.callback()
+def root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """A visual semantic database: RGB-D recordings become rows to ask questions of, images become camera poses.
+
+    Settings come from SEMDB_ environment variables; options override them. Exit codes: 0 done, 1 failed, 2 usage.
+    """
+
+
+def main() -> None:
+    """Entry point of the `semdb` command."""
+    try:
+        app(prog_name="semdb")
+    except KeyboardInterrupt as error:  # before a command began
+        sys.exit(report(error))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,114 @@
+"""Options that several commands share: settings as options, and names."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from semdb.errors import UsageError
+
+if TYPE_CHECKING:
+    from semdb.settings import Settings
+
+_PANEL = "Settings"
+
+DatabaseUrl = Annotated[
+    str | None,
+    typer.Option("--database-url", metavar="URL", help="Database; over SEMDB_DATABASE_URL.", rich_help_panel=_PANEL),
+]
+Detector = Annotated[
+    str | None,
+    typer.Option("--detector", metavar="SPEC", help="Object detector; over SEMDB_DETECTOR.", rich_help_panel=_PANEL),
+]
+Encoder = Annotated[
+    str | None,
+    typer.Option("--encoder", metavar="SPEC", help="Place encoder; over SEMDB_ENCODER.", rich_help_panel=_PANEL),
+]
+Features = Annotated[
+    str | None,
+    typer.Option("--features", metavar="SPEC", help="Local features; over SEMDB_FEATURES.", rich_help_panel=_PANEL),
+]
+Device = Annotated[
+    str | None,
+    typer.Option("--device", metavar="NAME", help="Device of the networks; over SEMDB_DEVICE.", rich_help_panel=_PANEL),
+]
+CameraOption = Annotated[
+    str | None,
+    typer.Option(
+        "--camera",
+        metavar="fx,fy,cx,cy[,k1,k2,p1,p2,k3]",
+        help="Intrinsics in pixels and lens distortion, instead of those known for the data set.",
+    ),
+]
+JsonFlag = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on stdout.")]
+
+
+@dataclass(frozen=True, slots=True)
+class Overrides:
+    """Settings given as options of one command; None where the environment or the default holds."""
+
+    database_url: str | None = None
+    detector: str | None = None
+    encoder: str | None = None
+    features: str | None = None
+    device: str | None = None
+
+    def settings(self) -> Settings:
+        """Settings of the environment under these options. Raises `UsageError` naming the variable or option."""
+        given = {field.name: getattr(self, field.name) for field in fields(self)}
+        return load_settings(**{name: value for name, value in given.items() if value is not None})
+
+
+def load_settings(**given: object) -> Settings:
+    """`Settings` from the environment and `given`. Raises `UsageError` naming what is wrong where."""
+    from pydantic import ValidationError
+
+    from semdb.settings import Settings
+
+    try:
+        return Settings(**given)  # type: ignore[arg-type]
+    except ValidationError as error:
+        problems = []
+        for detail in error.errors():
+            name = str(detail["loc"][0]) if detail["loc"] else ""
+            where = f"--{name.replace('_', '-')}" if name in given else f"SEMDB_{name.upper()}"
+            problems.append(f"{where}={detail['input']}: {detail['msg']}")
+        raise UsageError("; ".join(problems)) from None
+
+
+_DATABASE = {"database_url": DatabaseUrl}
+_MODELS = {**_DATABASE, "detector": Detector, "encoder": Encoder, "features": Features, "device": Device}
+
+
+def settings_options(*, models: bool) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Decorator: the parameter ``overrides: Overrides`` of a command becomes the options that change settings.
+
+    `models` False gives ``--database-url``; True adds ``--detector``, ``--encoder``, ``--features``, ``--device``.
+    """
+    options = _MODELS if models else _DATABASE
+
+    def decorate(function: Callable[..., None]) -> Callable[..., None]:
+        signature = inspect.signature(function, eval_str=True)
+        kept = [parameter for name, parameter in signature.parameters.items() if name != "overrides"]
+        added = [
+            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
+            for name, annotation in options.items()
+        ]
+
+        @functools.wraps(function)
+        def command(**arguments: Any) -> None:
+            overrides = Overrides(**{name: arguments.pop(name) for name in options})
+            function(**arguments, overrides=overrides)
+
+        new = signature.replace(parameters=[p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in kept] + added)
+        command.__signature__ = new
+        command.__annotations__ = {p.name: p.annotation for p in new.parameters.values()} | {"return": None}
+        del command.__wrapped__
+        return command
+
+    return decorate

@@ -1,0 +1,75 @@
+"""Progress on stderr: a bar with rate and time left on a terminal, a plain line every few seconds otherwise."""
+
+from __future__ import annotations
+
+import sys
+import time
+from types import TracebackType
+from typing import Any, Self, TextIO
+
+SECONDS_BETWEEN_LINES = 5.0
+
+
+def format_duration(seconds: float) -> str:
+    """``75.2`` becomes ``1:15``, ``3700`` becomes ``1:01:40``."""
+    minutes, rest = divmod(round(max(seconds, 0.0)), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+class Progress:
+    """Context manager whose `update` is the callback ``(done, total)`` that long functions take."""
+
+    def __init__(
+        self, label: str, unit: str = "frames", *, stream: TextIO | None = None, terminal: bool | None = None
+    ) -> None:
+        self.label, self.unit = label, unit
+        self.stream = stream or sys.stderr
+        self.terminal = self.stream.isatty() if terminal is None else terminal
+        self.started = self.printed = time.monotonic()
+        self._bar: Any = None
+        self._task: Any = None
+
+    def __enter__(self) -> Self:
+        self.started = self.printed = time.monotonic()
+        if self.terminal:
+            self._bar = _rich_bar(self.stream)
+            self._bar.start()
+            self._task = self._bar.add_task(self.label, total=None, unit=self.unit, rate="")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+    def update(self, done: int, total: int) -> None:
+        """Say that `done` of `total` are finished. Cheap: may be called for every frame."""
+        now = time.monotonic()
+        rate = done / max(now - self.started, 1e-9)
+        if self._bar is not None:
+            self._bar.update(self._task, completed=done, total=total, rate=f"{rate:.1f} {self.unit}/s")
+        elif now - self.printed >= SECONDS_BETWEEN_LINES:
+            self.printed = now
+            left = format_duration((total - done) / rate) if done else "?"
+            line = f"{self.label}: {done} of {total} {self.unit}, {rate:.1f}/s, {left} left"
+            print(line, file=self.stream, flush=True)
+
+
+def _rich_bar(stream: TextIO) -> Any:
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as RichProgress
+
+    return RichProgress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[unit]}"),
+        TextColumn("{task.fields[rate]}"),
+        TimeRemainingColumn(),
+        console=Console(file=stream),
+        transient=True,
+    )
