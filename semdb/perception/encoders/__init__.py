@@ -1,1 +1,29 @@
-"""semdb.perception.encoders"""
+"""Place encoders, one file each, found by their spec."""
+
+from __future__ import annotations
+
+from semdb.errors import ModelError, UsageError
+from semdb.perception.protocols import Encoder
+from semdb.settings import Settings
+
+
+def load_encoder(spec: str, settings: Settings, threads: int | None = None) -> Encoder:
+    """The encoder of a `spec`: ``onnx:FILE`` or ``gist``.
+
+    `threads` are those of the network, by default ``settings.threads``; they do not change the result.
+    Raises UsageError for a spec that is none, ModelError when its file is missing or is no encoder.
+    """
+    if spec == "gist":
+        from semdb.perception.encoders.gist import GistEncoder
+
+        return GistEncoder()
+    if spec.startswith("onnx:"):
+        from semdb.perception.encoders.onnx import OnnxEncoder
+
+        return OnnxEncoder(spec, settings, threads or settings.threads)
+    if spec.startswith("torchvision:"):
+        raise ModelError(
+            f"{spec!r}: torch models come with `pip install semdb[torch]`, but this version of semdb runs encoders "
+            "only as onnx:FILE or gist; export the model to ONNX and set SEMDB_ENCODER=onnx:FILE"
+        )
+    raise UsageError(f"no encoder {spec!r}: write onnx:FILE (image to `embedding`) or gist (needs no file)")

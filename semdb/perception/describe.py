@@ -1,0 +1,139 @@
+"""The one way from an image to a description, for keyframes and queries alike."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TypeVar
+
+import cv2
+
+from semdb.errors import FrameError
+from semdb.perception.detectors import load_detector
+from semdb.perception.encoders import load_encoder
+from semdb.perception.lifting import lift
+from semdb.perception.objects import assign_to_objects, object_geometry, sort_by_object
+from semdb.perception.protocols import Detector, Encoder, FeatureExtractor
+from semdb.settings import Settings
+from semdb.types import (
+    Camera,
+    Description,
+    Detection,
+    Features,
+    Float32Array,
+    ImageArray,
+    InstanceMasks,
+    Keypoints,
+    ModelInfo,
+    ObjectGeometry,
+)
+
+_Result = TypeVar("_Result")
+
+
+class Describer:
+    """A detector, an encoder and a local feature that together describe images.
+
+    With `beside` the detector runs in a thread beside the other two; the result is the same.
+    """
+
+    def __init__(
+        self, detector: Detector, encoder: Encoder, features: FeatureExtractor, *, beside: bool = False
+    ) -> None:
+        self.detector = detector
+        self.encoder = encoder
+        self.features = features
+        self._beside = beside
+        self._pool: ThreadPoolExecutor | None = None
+
+    @property
+    def models(self) -> tuple[ModelInfo, ...]:
+        """Provenance of what it makes: detector, encoder, features."""
+        return self.detector.info, self.encoder.info, self.features.info
+
+    def describe(
+        self,
+        image: ImageArray,
+        depth: Float32Array | None,
+        camera: Camera,
+        instances: InstanceMasks | None = None,
+    ) -> Description:
+        """All that can be said of an RGB `image` ``[H, W, 3]`` seen by `camera`.
+
+        `depth` ``[H, W]`` is metres with NaN where missing, or None: then all points are NaN. ``timing_ms`` has
+        the wall time of `detect`, `encode` and `features` (which includes objects and 3D points); with `beside`
+        the first runs at the time of the others. Raises FrameError when sizes disagree, ModelError when a model
+        fails, UsageError when the detector needs masks that the image does not bring.
+        """
+        _check_sizes(image, depth, camera)
+        detecting = self._start(lambda: _timed(lambda: self.detector.detect(image, instances)))
+        try:
+            vector, encode_ms = _timed(lambda: self.encoder.encode(image))
+            found, extract_ms = _timed(lambda: self.features.extract(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)))
+        finally:
+            detections, detect_ms = detecting.result()
+        (keypoints, geometry), lift_ms = _timed(lambda: _join(camera, depth, detections, found))
+        return Description(
+            camera=camera,
+            detections=detections,
+            geometry=geometry,
+            keypoints=keypoints,
+            cnn_vector=vector,
+            models=self.models,
+            timing_ms={"detect": detect_ms, "encode": encode_ms, "features": extract_ms + lift_ms},
+        )
+
+    def _start(self, work: Callable[[], _Result]) -> Future[_Result]:
+        if self._beside:
+            # Made on first use, not in the constructor: threads do not survive a worker's fork.
+            self._pool = self._pool or ThreadPoolExecutor(1, thread_name_prefix="semdb-detect")
+            return self._pool.submit(work)
+        done: Future[_Result] = Future()
+        done.set_result(work())
+        return done
+
+
+def describer_from_specs(detector: str, encoder: str, features: str, settings: Settings) -> Describer:
+    """The describer of three concrete specs (``auto`` is resolved before).
+
+    Raises UsageError for a spec that is none, ModelError when a model's file is missing or is not what it should be.
+    """
+    from semdb.perception.features import load_features
+
+    beside = settings.threads > 1 and detector.startswith("onnx:")
+    return Describer(
+        load_detector(detector, settings),
+        load_encoder(encoder, settings),
+        load_features(features, settings),
+        beside=beside,
+    )
+
+
+def _join(
+    camera: Camera, depth: Float32Array | None, detections: tuple[Detection, ...], features: Features
+) -> tuple[Keypoints, tuple[ObjectGeometry, ...]]:
+    owner = assign_to_objects(features.xy, [detection.mask for detection in detections])
+    ordered, object_index = sort_by_object(features, owner)
+    geometry = tuple(object_geometry(camera, depth, detection) for detection in detections)
+    return Keypoints(ordered, object_index, lift(camera, depth, ordered.xy)), geometry
+
+
+def _timed(work: Callable[[], _Result]) -> tuple[_Result, float]:
+    start = time.perf_counter()
+    result = work()
+    return result, 1000 * (time.perf_counter() - start)
+
+
+def _check_sizes(image: ImageArray, depth: Float32Array | None, camera: Camera) -> None:
+    height, width = image.shape[:2]
+    if (camera.width, camera.height) != (width, height):
+        raise FrameError(
+            f"the image is {width}x{height} but its camera is {camera.width}x{camera.height}: "
+            "give the camera of this image (--camera fx,fy,cx,cy)"
+        )
+    if depth is not None and depth.shape != (height, width):
+        raise FrameError(
+            f"the depth image is {depth.shape[1]}x{depth.shape[0]} but the image is {width}x{height}: "
+            "depth must be registered to the image and of its size"
+        )

@@ -1,0 +1,115 @@
+"""Files of networks: where a spec's file is, its hash, and how ONNX Runtime opens it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from semdb.errors import ModelError
+from semdb.settings import Settings
+
+_HASHES: dict[tuple[str, int, int], str] = {}
+
+
+def file_sha256(path: Path) -> str:
+    """Hex SHA-256 of a file's bytes, computed once per process for a path, size and modification time.
+
+    Raises ModelError naming the file when it cannot be read.
+    """
+    try:
+        stat = path.stat()
+        key = (str(path.resolve()), stat.st_size, stat.st_mtime_ns)
+        if key not in _HASHES:
+            with path.open("rb") as file:
+                _HASHES[key] = hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise ModelError(f"{path}: cannot read the model file ({error.strerror}); check its permissions") from error
+    return _HASHES[key]
+
+
+def models_dir(settings: Settings) -> Path:
+    """The folder where a bare file name of a spec is looked for when it is not in the current folder."""
+    return settings.cache_dir.expanduser() / "models"
+
+
+def resolve_onnx(spec: str, settings: Settings) -> Path:
+    """The file of a spec ``onnx:FILE``: ``~`` is expanded, a bare name is also looked for in the models folder.
+
+    Raises ModelError when the file is not there or is a folder.
+    """
+    text = spec.removeprefix("onnx:")
+    if not text:
+        raise ModelError(f"{spec!r} names no file: write onnx:FILE, with FILE the path of an .onnx file")
+    path = Path(text).expanduser()
+    tried = [path]
+    if path.name == text:
+        tried.append(models_dir(settings) / text)
+    for candidate in tried:
+        if candidate.is_file():
+            return candidate
+    if path.is_dir():
+        raise ModelError(f"{path} is a folder: write onnx:FILE, with FILE the path of an .onnx file in it")
+    places = " or ".join(str(candidate) for candidate in tried)
+    raise ModelError(f"no model file at {places} (from the spec {spec!r}): check the path, or put the file there")
+
+
+def canonical_json(config: dict[str, Any]) -> str:
+    """`config` as JSON with sorted keys and no spaces, so that equal configurations are equal strings."""
+    return json.dumps(config, sort_keys=True, separators=(",", ":"))
+
+
+class OnnxModel:
+    """An ONNX network with one image input ``[B, 3, H, W]``, opened on the CPU.
+
+    `path` is the file, `outputs` the names of all its outputs, `metadata` its ``metadata_props``.
+    """
+
+    def __init__(self, path: Path, threads: int, required_outputs: tuple[str, ...]) -> None:
+        """Open `path` with `threads` threads; its outputs must include `required_outputs`.
+
+        Raises ModelError when the file is no ONNX model or has other inputs or outputs.
+        """
+        import onnxruntime as ort
+
+        options = ort.SessionOptions()
+        options.intra_op_num_threads = threads
+        options.inter_op_num_threads = 1
+        # Idle ORT threads otherwise burn the cores that the local features need.
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        options.log_severity_level = 3
+        self.path = path
+        try:
+            self._session = ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # ONNX Runtime's exceptions share no base class
+            raise ModelError(
+                f"{path} cannot be opened as an ONNX model ({first_line(error)}); is it complete, and a model?"
+            ) from error
+        self.outputs = tuple(output.name for output in self._session.get_outputs())
+        self.metadata: dict[str, str] = dict(self._session.get_modelmeta().custom_metadata_map)
+        missing = [name for name in required_outputs if name not in self.outputs]
+        if missing:
+            raise ModelError(
+                f"{path} has no output {', '.join(missing)} (it has {', '.join(self.outputs)}): "
+                f"it is not a model for this role, or its outputs must be renamed to {', '.join(required_outputs)}"
+            )
+        self._required = required_outputs
+        inputs = self._session.get_inputs()
+        if len(inputs) != 1 or inputs[0].type != "tensor(float)" or len(inputs[0].shape) != 4:
+            found = "; ".join(f"{i.name}: {i.type} {i.shape}" for i in inputs)
+            raise ModelError(f"{path} must have one input, float32 [B, 3, H, W] RGB 0..1, but has {found}")
+        self._input = inputs[0].name
+
+    def run(self, batch: Any) -> list[Any]:
+        """The required outputs, in their order, for a float32 `batch` ``[B, 3, H, W]``. Raises ModelError."""
+        try:
+            return list(self._session.run(list(self._required), {self._input: batch}))
+        except Exception as error:
+            shape = "x".join(str(n) for n in batch.shape)
+            raise ModelError(f"{self.path} failed on an input of {shape}: {first_line(error)}") from error
+
+
+def first_line(error: Exception) -> str:
+    """The first line of an error's text, for a message on one line."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
