@@ -29,4 +29,7 @@ class Settings(BaseSettings):
     max_keypoints: int = Field(1500, ge=50, le=20000, description="keypoints kept per image, by response")
     threads: int = Field(2, ge=1, le=256, description="threads of one process for networks and kernels")
     cache_dir: Path = Field(Path("~/.cache/semdb"), description="compiled kernels, pulled models and saved indexes")
+    broker_url: str = Field(
+        "redis://localhost:6379/0", description="broker of the workers, redis://HOST:PORT/N or another of Celery's"
+    )
     sql_time_limit_s: float = Field(60.0, gt=0, description="time limit of `semdb sql`")
