@@ -1,0 +1,192 @@
+"""TUM's text lists, association by nearest time, and poses interpolated between samples."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from semdb.errors import RecordingError
+from semdb.geometry import pose_from, rotation_from_quat_wxyz, slerp_wxyz
+from semdb.types import FloatArray
+
+MAX_TIME_DIFFERENCE_NS = 20_000_000
+NORM_TOLERANCE = 0.05  # data sets round quaternions to four digits; more than this is no rotation
+
+Int64Array = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class BadLine:
+    """A line of a list that cannot be used."""
+
+    line: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class TimedFile:
+    """One line of ``rgb.txt`` or ``depth.txt``."""
+
+    time_ns: int
+    name: str
+    line: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """Pose samples in ascending time."""
+
+    time_ns: Int64Array  # [n]
+    quat_wxyz: FloatArray  # [n, 4], unit
+    translation: FloatArray  # [n, 3] metres
+
+
+def read_lines(path: Path) -> list[tuple[int, str]]:
+    """Numbered (from 1) lines that are neither empty nor a comment (#). Raises RecordingError."""
+    try:
+        text = path.read_text(encoding="utf-8-sig", errors="replace")
+    except FileNotFoundError as error:
+        raise RecordingError(f"{path}: the file is missing") from error
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
+    lines = ((number, line.strip()) for number, line in enumerate(text.splitlines(), start=1))
+    return [(number, line) for number, line in lines if line and not line.startswith("#")]
+
+
+def parse_time_ns(text: str) -> int:
+    """Nanoseconds of a decimal number of seconds, exactly. Raises ValueError with the reason."""
+    try:
+        seconds = Decimal(text)
+    except InvalidOperation as error:
+        raise ValueError(f"{text[:40]!r} is no time in seconds") from error
+    if not seconds.is_finite() or abs(seconds) > Decimal("9.2e9"):
+        raise ValueError(f"{text[:40]!r} is no time in seconds")
+    return int((seconds * 1_000_000_000).to_integral_value())
+
+
+def read_file_list(path: Path) -> tuple[list[TimedFile], list[BadLine]]:
+    """Lines of ``time filename`` in the order of the file, and those that cannot be used. Raises RecordingError."""
+    files, bad = [], []
+    for number, line in read_lines(path):
+        parts = line.split(maxsplit=1)
+        try:
+            if len(parts) != 2:
+                raise ValueError("needs a time and a file name")
+            files.append(TimedFile(parse_time_ns(parts[0]), parts[1], number))
+        except ValueError as error:
+            bad.append(BadLine(number, str(error)))
+    if not files:
+        where = f", line {bad[0].line}: {bad[0].reason}" if bad else ": lists no image"
+        raise RecordingError(f"{path}{where}; lines of 'time filename' are needed")
+    return files, bad
+
+
+def parse_pose(values: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+    """Unit quaternion wxyz and translation of seven texts ``tx ty tz qx qy qz qw``. Raises ValueError."""
+    if len(values) != 7:
+        raise ValueError(f"needs tx ty tz qx qy qz qw, but has {len(values)} numbers")
+    try:
+        numbers = np.array([float(value) for value in values])
+    except ValueError as error:
+        raise ValueError("has something that is no number") from error
+    if not np.isfinite(numbers).all():
+        raise ValueError("has a number that is not finite")
+    x, y, z, w = numbers[3:]
+    quat_wxyz = np.array([w, x, y, z])
+    norm = float(np.linalg.norm(quat_wxyz))
+    if abs(norm - 1) > NORM_TOLERANCE:
+        raise ValueError(f"is no rotation: the quaternion has length {norm:.3g} instead of 1")
+    return quat_wxyz / norm, numbers[:3]
+
+
+def read_trajectory(path: Path) -> tuple[Trajectory, list[str]]:
+    """Poses of a TUM trajectory (``time tx ty tz qx qy qz qw``) sorted by time, and notes on what was not right.
+
+    Lines that cannot be used are left out and noted; of equal times the first is kept.
+    Raises RecordingError when no line can be used.
+    """
+    samples: list[tuple[int, FloatArray, FloatArray]] = []
+    bad: list[BadLine] = []
+    for number, line in read_lines(path):
+        values = line.split()
+        try:
+            samples.append((parse_time_ns(values[0]), *parse_pose(values[1:])))
+        except ValueError as error:
+            bad.append(BadLine(number, str(error)))
+    if not samples:
+        where = f", line {bad[0].line}: {bad[0].reason}" if bad else ": has no pose"
+        raise RecordingError(f"{path}{where}; lines of 'time tx ty tz qx qy qz qw' are needed")
+    notes = [bad_lines_note(path.name, bad, "poses")] if bad else []
+    times = np.array([sample[0] for sample in samples], dtype=np.int64)
+    if (np.diff(times) < 0).any():
+        notes.append(f"{path.name}: times are not in ascending order; sorted")
+    order = np.argsort(times, kind="stable")
+    first = np.concatenate([[True], np.diff(times[order]) > 0])
+    if not first.all():
+        notes.append(f"{path.name}: {int((~first).sum())} repeated time(s); the first pose of each is kept")
+    keep = order[first]
+    trajectory = Trajectory(
+        times[keep], np.stack([samples[i][1] for i in keep]), np.stack([samples[i][2] for i in keep])
+    )
+    return trajectory, notes
+
+
+def bad_lines_note(file_name: str, bad: Sequence[BadLine], what: str) -> str:
+    """One sentence for people about the lines that were left out."""
+    first = bad[0]
+    return (
+        f"{file_name}: {len(bad)} line(s) with unusable {what} left out, the first is line {first.line}: {first.reason}"
+    )
+
+
+def pose_at(trajectory: Trajectory, time_ns: int) -> tuple[FloatArray | None, int]:
+    """The pose ``[4, 4]`` at a time, and the distance in ns to the nearest sample; None beyond 20 ms.
+
+    Between two samples the rotation is interpolated spherically and the translation linearly; before the first
+    and after the last sample (within 20 ms) that sample is taken.
+    """
+    times = trajectory.time_ns
+    after = int(np.searchsorted(times, time_ns))
+    gaps = [(abs(int(times[i]) - time_ns), i) for i in (after - 1, after) if 0 <= i < len(times)]
+    gap, nearest = min(gaps)
+    if gap > MAX_TIME_DIFFERENCE_NS:
+        return None, gap
+    if gap == 0 or len(gaps) == 1:
+        return pose_from(rotation_from_quat_wxyz(trajectory.quat_wxyz[nearest]), trajectory.translation[nearest]), gap
+    before = after - 1
+    fraction = (time_ns - int(times[before])) / (int(times[after]) - int(times[before]))
+    quat_wxyz = slerp_wxyz(trajectory.quat_wxyz[before], trajectory.quat_wxyz[after], fraction)
+    translation = (1 - fraction) * trajectory.translation[before] + fraction * trajectory.translation[after]
+    return pose_from(rotation_from_quat_wxyz(quat_wxyz), translation), gap
+
+
+def nearest_pairs(first_ns: Int64Array, second_ns: Int64Array) -> tuple[list[int | None], Int64Array]:
+    """One-to-one association of two ascending lists of times within 20 ms, the nearest pairs first.
+
+    Returns for each of `first_ns` its partner in `second_ns` or None, and the distance (ns) to the nearest of
+    all, taken or not.
+    """
+    right = np.searchsorted(second_ns, first_ns)
+    index = np.arange(len(first_ns))
+    pairs = []
+    nearest = np.full(len(first_ns), np.iinfo(np.int64).max, dtype=np.int64)
+    # the partner of a one-to-one match may be the second nearest: look at two on each side
+    for shift in (-2, -1, 0, 1):
+        j = right + shift
+        inside = (j >= 0) & (j < len(second_ns))
+        gap = np.abs(second_ns[np.clip(j, 0, len(second_ns) - 1)] - first_ns)
+        nearest[inside] = np.minimum(nearest[inside], gap[inside])
+        close = inside & (gap <= MAX_TIME_DIFFERENCE_NS)
+        pairs += list(zip(gap[close].tolist(), index[close].tolist(), j[close].tolist(), strict=True))
+    partner: list[int | None] = [None] * len(first_ns)
+    taken: set[int] = set()
+    for _, i, j in sorted(pairs):
+        if partner[i] is None and j not in taken:
+            partner[i] = j
+            taken.add(j)
+    return partner, nearest

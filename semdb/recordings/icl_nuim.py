@@ -1,0 +1,131 @@
+"""ICL-NUIM in its TUM-compatible PNG layout.
+
+The data set was rendered in a left-handed world with y up: its camera has x right, y up, z forward, which is why
+its page gives fy = -480. The TUM-compatible PNGs are stored top row first like any other image, and
+``*.gt.freiburg`` holds the left-handed poses. With F = diag(1, -1, 1, 1), a pixel back-projected with fy = +480
+is F times the point in the renderer's camera, and the mirrored world F X is right-handed, so the pose of an
+OpenCV camera is F P F: the signs of ty, qx and qz change. Without it depth images of two frames do not meet.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from semdb.errors import RecordingError
+from semdb.geometry import pose_from, rotation_from_quat_wxyz
+from semdb.recordings.assembly import Draft, finish
+from semdb.recordings.association import BadLine, bad_lines_note, parse_pose, read_lines
+from semdb.recordings.base import DroppedFrame, FrameEntry, Recording
+from semdb.recordings.cameras import ICL_NUIM, TUM_DEPTH_SCALE
+from semdb.types import Camera, FloatArray
+
+ASSOCIATIONS = "associations.txt"
+POSES = "*.gt.freiburg"
+FLIP_Y = np.diag([1.0, -1.0, 1.0, 1.0])
+
+
+def is_icl_nuim(path: Path) -> bool:
+    """Whether a folder has ICL-NUIM's poses, or its associations without TUM's lists."""
+    return any(path.glob(POSES)) or ((path / ASSOCIATIONS).is_file() and not (path / "rgb.txt").is_file())
+
+
+def open_icl_nuim(path: Path, camera: Camera | None = None) -> Recording:
+    """A recording with ``rgb/N.png``, ``depth/N.png``, ``associations.txt`` and one ``*.gt.freiburg``.
+
+    Frames have no times (`timestamp_ns` None): the format numbers them. Frames without a pose (the data set has
+    none for frame 0) are dropped. Without ``associations.txt`` the images are paired by number.
+    Raises RecordingError.
+    """
+    rows, dropped = _read_associations(path) if (path / ASSOCIATIONS).is_file() else _list_images(path)
+    draft = Draft(
+        path=path,
+        name=path.resolve().name,
+        format="icl_nuim",
+        total_frames=len(rows) + len(dropped),
+        entries=[],
+        dropped=dropped,
+        known_camera=ICL_NUIM,
+        depth_scale=TUM_DEPTH_SCALE,
+    )
+    if [row[0] for row in rows] != sorted(row[0] for row in rows):
+        draft.notes.append(f"{ASSOCIATIONS}: frame numbers are not in ascending order; sorted")
+    poses = _read_poses(path, draft.notes)
+    used: dict[int, str] = {}
+    for index, (number, depth_name, colour_name) in enumerate(sorted(rows, key=lambda row: row[0])):
+        if number in used:
+            draft.dropped.append(DroppedFrame(colour_name, f"same frame number as {used[number]}"))
+            continue
+        used[number] = colour_name
+        if poses is not None and number not in poses:
+            draft.dropped.append(DroppedFrame(colour_name, f"no pose for frame {number} in the ground truth"))
+            continue
+        pose = None if poses is None else poses[number]
+        draft.entries.append(FrameEntry(index, colour_name, None, path / colour_name, path / depth_name, None, pose))
+    return finish(draft, camera)
+
+
+def pose_from_icl(pose: FloatArray) -> FloatArray:
+    """World-from-camera of an OpenCV camera in the mirrored (right-handed, y down) world of a renderer's `pose`."""
+    return np.asarray(FLIP_Y @ pose @ FLIP_Y)
+
+
+def _read_associations(path: Path) -> tuple[list[tuple[int, str, str]], list[DroppedFrame]]:
+    """Rows of (frame number, depth name, colour name), and the lines that cannot be used."""
+    rows: list[tuple[int, str, str]] = []
+    bad: list[BadLine] = []
+    for line_number, line in read_lines(path / ASSOCIATIONS):
+        parts = line.split()
+        if len(parts) == 4 and parts[0].isdecimal() and parts[2].isdecimal():
+            # the colour image decides the number; the order of the two columns differs between copies
+            colour_first = "rgb" in parts[1] and "depth" in parts[3]
+            colour, depth = (1, 3) if colour_first else (3, 1)
+            rows.append((int(parts[colour - 1]), parts[depth], parts[colour]))
+        else:
+            bad.append(BadLine(line_number, "needs 'N depth/N.png N rgb/N.png'"))
+    if not rows:
+        where = f", line {bad[0].line}: {bad[0].reason}" if bad else ": lists no image"
+        raise RecordingError(f"{path / ASSOCIATIONS}{where}")
+    return rows, [DroppedFrame(f"{ASSOCIATIONS} line {line.line}", line.reason) for line in bad]
+
+
+def _list_images(path: Path) -> tuple[list[tuple[int, str, str]], list[DroppedFrame]]:
+    colour = sorted((int(file.stem), file.name) for file in (path / "rgb").glob("*.png") if file.stem.isdecimal())
+    if not colour:
+        raise RecordingError(f"{path}: neither {ASSOCIATIONS} nor images rgb/N.png; ICL-NUIM's PNG layout has both")
+    return [(number, f"depth/{name}", f"rgb/{name}") for number, name in colour], []
+
+
+def _read_poses(path: Path, notes: list[str]) -> dict[int, FloatArray] | None:
+    files = sorted(path.glob(POSES))
+    if not files:
+        notes.append(f"no {POSES}: the frames have no pose and cannot become keyframes")
+        return None
+    if len(files) > 1:
+        names = ", ".join(file.name for file in files)
+        raise RecordingError(f"{path}: several ground truths ({names}); keep the one of this recording")
+    poses: dict[int, FloatArray] = {}
+    bad: list[BadLine] = []
+    repeated = 0
+    for line_number, line in read_lines(files[0]):
+        values = line.split()
+        try:
+            if not re.fullmatch(r"\d+(\.0*)?", values[0]):
+                raise ValueError(f"{values[0][:40]!r} is no frame number")
+            quat_wxyz, translation = parse_pose(values[1:])
+        except ValueError as error:
+            bad.append(BadLine(line_number, str(error)))
+            continue
+        number = int(values[0].split(".")[0])
+        repeated += number in poses
+        poses.setdefault(number, pose_from_icl(pose_from(rotation_from_quat_wxyz(quat_wxyz), translation)))
+    if not poses:
+        where = f", line {bad[0].line}: {bad[0].reason}" if bad else ": has no pose"
+        raise RecordingError(f"{files[0]}{where}; lines of 'N tx ty tz qx qy qz qw' are needed")
+    if bad:
+        notes.append(bad_lines_note(files[0].name, bad, "poses"))
+    if repeated:
+        notes.append(f"{files[0].name}: {repeated} repeated frame number(s); the first pose of each is kept")
+    return poses

@@ -1,0 +1,261 @@
+"""Image files: cheap checks of headers and ends, and decoding that never returns half an image.
+
+OpenCV decodes a truncated PNG or JPEG in part and says nothing, so the structure of the file is checked first:
+PNG chunks with their checksums up to IEND, JPEG markers up to EOI.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from semdb.errors import FrameError
+from semdb.types import Float32Array, ImageArray
+
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+PNG_END = b"\x00\x00\x00\x00IEND\xaeB`\x82"
+PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}
+JPEG_START = b"\xff\xd8\xff"
+JPEG_END = b"\xff\xd9"
+JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+# In entropy-coded data a marker is 0xFF followed by anything but a stuffed zero, a restart or another fill byte.
+JPEG_MARKER_IN_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
+TAIL = 4096
+TRUNCATED = "the file ends too early (truncated); copy or record it again"
+NOT_AN_IMAGE = "is not a PNG or JPEG image"
+
+
+@dataclass(frozen=True, slots=True)
+class ImageHeader:
+    """What the header of an image file says; `channels` counts a palette image as 3."""
+
+    kind: str  # "png" or "jpeg"
+    width: int
+    height: int
+    bits: int
+    channels: int
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        return self.width, self.height
+
+
+class _ImageError(ValueError):
+    """Why a file is no whole image; without the file's name."""
+
+
+def inspect_file(path: Path) -> ImageHeader:
+    """Header of a PNG or JPEG file, and a cheap check that its end is there; nothing is decoded.
+
+    Raises FrameError whose message is the reason alone, without the name of the file.
+    """
+    try:
+        with path.open("rb") as file:
+            start = file.read(33)
+            if not start:
+                raise _ImageError("the file is empty")
+            if start.startswith(PNG_SIGNATURE):
+                header = _png_header(start)
+                _check_png_end(file)
+            elif start.startswith(JPEG_START):
+                header = _jpeg_header(file)
+                _check_jpeg_end(file)
+            else:
+                raise _ImageError(NOT_AN_IMAGE)
+    except FileNotFoundError as error:
+        raise FrameError("the file is missing") from error
+    except OSError as error:
+        raise FrameError(f"the file cannot be read: {error.strerror}") from error
+    except _ImageError as error:
+        raise FrameError(str(error)) from error
+    return header
+
+
+def _png_header(start: bytes) -> ImageHeader:
+    if len(start) < 33:
+        raise _ImageError(TRUNCATED)
+    length, kind, width, height, bits, colour = struct.unpack(">I4sIIBB", start[8:26])
+    if kind != b"IHDR" or length != 13 or colour not in PNG_CHANNELS or not width or not height:
+        raise _ImageError("has a broken PNG header")
+    return ImageHeader("png", width, height, bits, PNG_CHANNELS[colour])
+
+
+def _check_png_end(file: BinaryIO) -> None:
+    size = file.seek(0, os.SEEK_END)
+    file.seek(max(0, size - len(PNG_END)))
+    if file.read() == PNG_END:
+        return
+    position = len(PNG_SIGNATURE)  # bytes may follow IEND: walk the chunks before calling it truncated
+    while position + 12 <= size:
+        file.seek(position)
+        length, kind = struct.unpack(">I4s", file.read(8))
+        position += length + 12
+        if kind == b"IEND" and position <= size:
+            return
+    raise _ImageError(TRUNCATED)
+
+
+def _jpeg_header(file: BinaryIO) -> ImageHeader:
+    file.seek(2)
+    while True:
+        marker = file.read(2)
+        while len(marker) == 2 and marker == b"\xff\xff":
+            marker = marker[1:] + file.read(1)
+        if len(marker) < 2:
+            raise _ImageError(TRUNCATED)
+        if marker[0] != 0xFF or marker[1] == 0xDA:
+            raise _ImageError("has a broken JPEG header")
+        body = file.read(2)
+        if len(body) < 2:
+            raise _ImageError(TRUNCATED)
+        length = int.from_bytes(body, "big")
+        if marker[1] in JPEG_FRAMES:
+            frame = file.read(6)
+            if len(frame) < 6:
+                raise _ImageError(TRUNCATED)
+            bits, height, width, channels = struct.unpack(">BHHB", frame)
+            return ImageHeader("jpeg", width, height, bits, channels)
+        file.seek(length - 2, os.SEEK_CUR)
+
+
+def _check_jpeg_end(file: BinaryIO) -> None:
+    size = file.seek(0, os.SEEK_END)
+    file.seek(max(0, size - TAIL))
+    if JPEG_END not in file.read():
+        raise _ImageError(TRUNCATED)
+
+
+def _check_png_bytes(data: bytes) -> None:
+    """Walks all chunks with their checksums; libpng would print, and give back what it has."""
+    view = memoryview(data)
+    position = len(PNG_SIGNATURE)
+    while position + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, position)
+        end = position + 8 + length
+        if end + 4 > len(data):
+            break
+        if zlib.crc32(view[position + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
+            raise _ImageError(f"is damaged: wrong checksum of PNG chunk at byte {position}")
+        if kind == b"IEND":
+            return
+        position = end + 4
+    raise _ImageError(TRUNCATED)
+
+
+def _check_jpeg_bytes(data: bytes) -> None:
+    """Walks the markers up to EOI, over entropy-coded data as well."""
+    position, scans = 2, 0
+    while position + 2 <= len(data):
+        if data[position] != 0xFF:
+            raise _ImageError(f"is damaged: no JPEG marker at byte {position}")
+        marker = data[position + 1]
+        if marker == 0xFF:
+            position += 1
+        elif marker == 0xD9:
+            if scans == 0:
+                raise _ImageError("is damaged: a JPEG without image data")
+            return
+        else:
+            position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
+            if marker == 0xDA:
+                scans += 1
+                found = JPEG_MARKER_IN_SCAN.search(data, position)
+                position = found.start() if found else len(data)
+    raise _ImageError(TRUNCATED)
+
+
+def _decode(data: bytes, flags: int) -> npt.NDArray[Any]:
+    if not data:
+        raise _ImageError("the file is empty")
+    if data.startswith(PNG_SIGNATURE):
+        _png_header(data[:33])
+        _check_png_bytes(data)
+    elif data.startswith(JPEG_START):
+        _check_jpeg_bytes(data)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error as error:
+        raise _ImageError(f"cannot be decoded: {error.err}") from error
+    if image is None:
+        raise _ImageError("is not an image that can be decoded (PNG and JPEG can)")
+    return np.asarray(image)
+
+
+def decode_color(data: bytes, name: str) -> ImageArray:
+    """RGB ``[H, W, 3]`` uint8 of a PNG, JPEG (or what else OpenCV decodes) in memory.
+
+    Grey images get three equal channels, transparency is dropped, 16-bit images are scaled to 8 bits. An
+    orientation mark of a telephone is not applied: intrinsics belong to the pixels as stored.
+    `name` is for messages. Raises FrameError for what is no image, truncated or damaged.
+    """
+    try:
+        bgr = _decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    except _ImageError as error:
+        raise FrameError(f"{name}: {error}") from error
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def decode_16bit(data: bytes, name: str, size: tuple[int, int], what: str = "a depth image") -> npt.NDArray[np.uint16]:
+    """The 16-bit values ``[H, W]`` of a PNG in memory; `size` is the expected (width, height).
+
+    `what` names the content in messages. Raises FrameError, also for another size, type or channel count.
+    """
+    try:
+        image = _decode(data, cv2.IMREAD_UNCHANGED)
+    except _ImageError as error:
+        raise FrameError(f"{name}: {error}") from error
+    if image.dtype != np.uint16 or image.ndim != 2:
+        channels = 1 if image.ndim == 2 else image.shape[2]
+        raise FrameError(
+            f"{name}: {what} needs one channel of 16 bits, this has {channels} of {image.dtype.itemsize * 8} bits"
+        )
+    if image.shape != (size[1], size[0]):
+        raise FrameError(
+            f"{name}: {what} of {image.shape[1]}x{image.shape[0]} pixels, but {size[0]}x{size[1]} are needed"
+        )
+    return np.asarray(image)
+
+
+def decode_depth(data: bytes, name: str, depth_scale: float, size: tuple[int, int]) -> Float32Array:
+    """Depth ``[H, W]`` float32 metres, NaN where invalid, of a 16-bit PNG in memory, not yet registered.
+
+    `depth_scale` is units per metre, `size` the expected (width, height), `name` for messages. The values 0 (no
+    measurement) and 65535 (7-Scenes' mark, and saturation everywhere) are invalid. Raises FrameError.
+    """
+    raw = decode_16bit(data, name, size)
+    depth = raw.astype(np.float32)
+    depth *= np.float32(1.0 / depth_scale)
+    depth[(raw == 0) | (raw == 65535)] = np.nan
+    return depth
+
+
+def read_bytes(path: Path) -> bytes:
+    """The bytes of a file. Raises FrameError when it is missing or cannot be read."""
+    try:
+        return path.read_bytes()
+    except FileNotFoundError as error:
+        raise FrameError(f"{path}: no such file") from error
+    except IsADirectoryError as error:
+        raise FrameError(f"{path}: is a folder, not an image") from error
+    except OSError as error:
+        raise FrameError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def read_query_image(path: Path) -> ImageArray:
+    """RGB ``[H, W, 3]`` uint8 of an image file; see `decode_color`. Raises FrameError naming the file."""
+    return decode_color(read_bytes(path), str(path))
+
+
+def read_depth_image(path: Path, depth_scale: float, size: tuple[int, int]) -> Float32Array:
+    """Depth ``[H, W]`` float32 metres of a 16-bit PNG file; see `decode_depth`. Raises FrameError naming the file."""
+    return decode_depth(read_bytes(path), str(path), depth_scale, size)

@@ -1,0 +1,165 @@
+"""TUM RGB-D layout, and recordings of one's own or synthetic ones that follow it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from semdb.errors import RecordingError
+from semdb.recordings.assembly import Draft, finish
+from semdb.recordings.association import (
+    MAX_TIME_DIFFERENCE_NS,
+    TimedFile,
+    Trajectory,
+    bad_lines_note,
+    nearest_pairs,
+    pose_at,
+    read_file_list,
+    read_trajectory,
+)
+from semdb.recordings.base import DroppedFrame, FrameEntry, Recording
+from semdb.recordings.cameras import CAMERA_FILE, TUM_DEPTH_SCALE, read_camera_file, tum_camera
+from semdb.types import Camera
+
+LIMIT_MS = MAX_TIME_DIFFERENCE_NS / 1e6
+
+
+def is_tum(path: Path) -> bool:
+    """Whether a folder has TUM's list of colour images."""
+    return (path / "rgb.txt").is_file()
+
+
+def open_tum(path: Path, camera: Camera | None = None) -> Recording:
+    """A recording with ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``; with ``masks/`` it is a synthetic one.
+
+    The camera is, in this order: the one given, ``camera.json``, the one that the folder's name stands for, ROS'
+    default (noted). Depth is associated within 20 ms and poses are interpolated; frames without are dropped, but
+    a recording without ``depth.txt`` or ``groundtruth.txt`` has all its frames without them (noted).
+    Raises RecordingError.
+    """
+    name = path.resolve().name
+    files, bad = read_file_list(path / "rgb.txt")
+    draft = Draft(
+        path=path,
+        name=name,
+        format="tum",
+        total_frames=len(files) + len(bad),
+        entries=[],
+        dropped=[DroppedFrame(f"rgb.txt line {line.line}", line.reason) for line in bad],
+        depth_scale=TUM_DEPTH_SCALE,
+    )
+    colour = _sorted_by_time(files, "rgb.txt", draft.notes)
+    depth = _read_depth_list(path, draft.notes)
+    trajectory = _read_poses(path, draft.notes)
+    draft.categories = read_categories(path)
+    if draft.categories is not None:
+        draft.format = "synthetic"
+    _set_camera(draft, path, name, camera)
+    _associate(draft, colour, depth, trajectory)
+    return finish(draft, camera)
+
+
+def read_categories(path: Path) -> dict[int, str] | None:
+    """Class name of each mask label (``masks/classes.json``); None where there is no folder ``masks``."""
+    if not (path / "masks").is_dir():
+        return None
+    file = path / "masks" / "classes.json"
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise RecordingError(f'{file}: the file is missing; it names the labels: {{"1": "chair", ...}}') from error
+    except OSError as error:
+        raise RecordingError(f"{file}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise RecordingError(f"{file}: is not a text file") from error
+    except json.JSONDecodeError as error:
+        raise RecordingError(f"{file}, line {error.lineno}: is not JSON: {error.msg}") from error
+    if not isinstance(content, dict):
+        raise RecordingError(f'{file}: must be a JSON object {{"1": "chair", ...}}')
+    categories = {}
+    for key, value in content.items():
+        if not (key.isascii() and key.isdigit()) or not 1 <= int(key) <= 65535 or not isinstance(value, str):
+            raise RecordingError(f"{file}: key {key!r} must be a label from 1 to 65535 with a class name as text")
+        categories[int(key)] = value
+    return categories
+
+
+def _sorted_by_time(files: list[TimedFile], list_name: str, notes: list[str]) -> list[TimedFile]:
+    ordered = sorted(files, key=lambda file: file.time_ns)  # stable: of equal times the first line stays first
+    if ordered != files:
+        notes.append(f"{list_name}: times are not in ascending order; sorted")
+    return ordered
+
+
+def _read_depth_list(path: Path, notes: list[str]) -> list[TimedFile] | None:
+    if not (path / "depth.txt").is_file():
+        notes.append("no depth.txt: the frames have no depth")
+        return None
+    files, bad = read_file_list(path / "depth.txt")
+    if bad:
+        notes.append(bad_lines_note("depth.txt", bad, "times or names"))
+    ordered = _sorted_by_time(files, "depth.txt", notes)
+    unique = [file for i, file in enumerate(ordered) if i == 0 or file.time_ns != ordered[i - 1].time_ns]
+    if len(unique) < len(ordered):
+        notes.append(f"depth.txt: {len(ordered) - len(unique)} repeated time(s); the first image of each is kept")
+    return unique
+
+
+def _read_poses(path: Path, notes: list[str]) -> Trajectory | None:
+    if not (path / "groundtruth.txt").is_file():
+        notes.append("no groundtruth.txt: the frames have no pose and cannot become keyframes")
+        return None
+    trajectory, pose_notes = read_trajectory(path / "groundtruth.txt")
+    notes += pose_notes
+    return trajectory
+
+
+def _set_camera(draft: Draft, path: Path, name: str, camera: Camera | None) -> None:
+    if (path / CAMERA_FILE).is_file():
+        draft.known_camera, draft.depth_scale = read_camera_file(path / CAMERA_FILE)
+        return
+    draft.known_camera, note = tum_camera(name)
+    if note and camera is None:
+        draft.notes.append(note)
+
+
+def _associate(
+    draft: Draft, colour: list[TimedFile], depth: list[TimedFile] | None, trajectory: Trajectory | None
+) -> None:
+    """Fills `draft` with the frames that have all the recording has, and drops the others."""
+    kept: list[tuple[int, TimedFile]] = []
+    for index, file in enumerate(colour):
+        if kept and kept[-1][1].time_ns == file.time_ns:
+            draft.dropped.append(DroppedFrame(file.name, f"same time as {kept[-1][1].name} (rgb.txt line {file.line})"))
+        else:
+            kept.append((index, file))
+    partner: list[int | None] = [None] * len(kept)
+    gaps = np.zeros(len(kept), dtype=np.int64)
+    if depth is not None:
+        times = np.array([file.time_ns for _, file in kept], dtype=np.int64)
+        partner, gaps = nearest_pairs(times, np.array([file.time_ns for file in depth], dtype=np.int64))
+    for (index, file), match, gap in zip(kept, partner, gaps.tolist(), strict=True):
+        if depth is not None and match is None:
+            reason = f"no depth image within {LIMIT_MS:g} ms (the nearest: {gap / 1e6:.1f} ms)"
+            draft.dropped.append(DroppedFrame(file.name, reason))
+            continue
+        pose = None
+        if trajectory is not None:
+            pose, pose_gap = pose_at(trajectory, file.time_ns)
+            if pose is None:
+                reason = f"no pose within {LIMIT_MS:g} ms (the nearest: {pose_gap / 1e6:.1f} ms)"
+                draft.dropped.append(DroppedFrame(file.name, reason))
+                continue
+        draft.entries.append(
+            FrameEntry(
+                index=index,
+                name=file.name,
+                timestamp_ns=file.time_ns,
+                image_path=draft.path / file.name,
+                depth_path=draft.path / depth[match].name if depth is not None and match is not None else None,
+                masks_path=None if draft.categories is None else draft.path / "masks" / f"{Path(file.name).stem}.png",
+                world_from_camera=pose,
+            )
+        )
