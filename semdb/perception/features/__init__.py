@@ -1,1 +1,29 @@
-"""semdb.perception.features"""
+"""Local features, one file each, found by their spec."""
+
+from __future__ import annotations
+
+from semdb.errors import ModelError
+from semdb.perception.protocols import FeatureExtractor
+from semdb.settings import Settings
+
+KNOWN = ("surf", "sift", "orb")
+
+
+def load_features(spec: str, settings: Settings) -> FeatureExtractor:
+    """The local feature of a `spec`: ``surf``, ``sift`` or ``orb``, with at most ``settings.max_keypoints`` per image.
+
+    Raises ModelError for another spec.
+    """
+    if spec == "surf":
+        from semdb.perception.features.surf_features import SurfFeatures
+
+        return SurfFeatures(max_keypoints=settings.max_keypoints, threads=settings.threads)
+    if spec == "sift":
+        from semdb.perception.features.sift import SiftFeatures
+
+        return SiftFeatures(max_keypoints=settings.max_keypoints)
+    if spec == "orb":
+        from semdb.perception.features.orb import OrbFeatures
+
+        return OrbFeatures(max_keypoints=settings.max_keypoints)
+    raise ModelError(f"no local feature {spec!r}: SEMDB_FEATURES knows {', '.join(KNOWN)}")

@@ -1,0 +1,50 @@
+"""`kernel`: numba as this package uses it, nogil and cached on disk, uncached where no folder can be written."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, TypeVar
+
+import numba
+
+logger = logging.getLogger(__name__)
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
+
+def kernel(function: _Function) -> _Function:
+    """Compile `function` at its first call, without the GIL. The result is cached beside the source, in
+    ``NUMBA_CACHE_DIR`` or in the user's cache; where none can be written a warning is logged once per process and
+    every process compiles anew.
+    """
+    _check_named_folder(numba.config.CACHE_DIR)
+    try:
+        return numba.njit(function, nogil=True, cache=True)  # type: ignore[no-any-return]
+    except RuntimeError as error:  # numba found no folder that it may write
+        _warn_uncached(str(error))
+        return numba.njit(function, nogil=True)  # type: ignore[no-any-return]
+
+
+@lru_cache(maxsize=8)
+def _check_named_folder(folder: str) -> None:
+    if not folder:
+        return
+    try:
+        os.makedirs(folder, exist_ok=True)
+        writable = os.access(folder, os.W_OK)
+    except OSError:
+        writable = False
+    if not writable:
+        logger.warning("NUMBA_CACHE_DIR=%s cannot be written; compiled kernels go to numba's default folder", folder)
+
+
+@lru_cache(maxsize=1)
+def _warn_uncached(reason: str) -> None:
+    logger.warning(
+        "compiled kernels cannot be cached (%s); every process compiles them anew, about 10 s. "
+        "Set NUMBA_CACHE_DIR to a folder that can be written",
+        reason,
+    )
