@@ -1,0 +1,139 @@
+"""Arrays and masks as blobs: little-endian, with dtype, shape, version and checksum, refused when anything is off.
+
+Layout of an array: magic ``SDBA``, version (1 byte), dtype code (1), number of dimensions (1), zero (1), CRC-32 of
+all that follows (4), shape (4 each), data in C order. A mask (magic ``SDBM``) is the same with a one-dimensional
+uint32 array: height, width, then the lengths of the runs of the row-major mask, the first run being background.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semdb.errors import CodecError
+from semdb.types import BoolArray, Features, Float32Array, IntArray, Keypoints
+
+ARRAY_MAGIC = b"SDBA"
+MASK_MAGIC = b"SDBM"
+VERSION = 1
+KEYPOINT_COLUMNS = ("x", "y", "size", "angle", "response", "laplacian", "X", "Y", "Z")
+
+_HEADER = struct.Struct("<4sBBBBI")
+_DTYPES: dict[int, np.dtype[Any]] = {
+    1: np.dtype("<f4"),
+    2: np.dtype("u1"),
+    3: np.dtype("<f8"),
+    4: np.dtype("<i4"),
+    5: np.dtype("<u4"),
+}
+_CODES = {dtype: code for code, dtype in _DTYPES.items()}
+
+
+def encode_array(array: npt.NDArray[Any], *, magic: bytes = ARRAY_MAGIC) -> bytes:
+    """`array` as a blob. Raises CodecError for a dtype that has no code (float32, uint8, float64, int32, uint32)."""
+    dtype = array.dtype.newbyteorder("<")
+    code = _CODES.get(dtype)
+    if code is None or array.ndim > 8:
+        raise CodecError(f"an array of {array.dtype} with {array.ndim} dimensions cannot be stored")
+    body = struct.pack(f"<{array.ndim}I", *array.shape) + np.ascontiguousarray(array, dtype=dtype).tobytes()
+    return _HEADER.pack(magic, VERSION, code, array.ndim, 0, zlib.crc32(body)) + body
+
+
+def decode_array(blob: bytes, where: str, *, magic: bytes = ARRAY_MAGIC) -> npt.NDArray[Any]:
+    """The read-only array of a blob. `where` names the row for the message of the CodecError that it raises."""
+    if len(blob) < _HEADER.size:
+        raise CodecError(f"{where}: the blob is truncated ({len(blob)} bytes)")
+    found, version, code, ndim, _, checksum = _HEADER.unpack_from(blob)
+    if found != magic:
+        raise CodecError(f"{where}: not a blob of this kind (it starts with {found!r}, expected {magic!r})")
+    if version != VERSION:
+        raise CodecError(f"{where}: blob format {version} is unknown, this semdb reads {VERSION}; upgrade semdb")
+    dtype = _DTYPES.get(code)
+    if dtype is None or ndim > 8 or len(blob) < _HEADER.size + 4 * ndim:
+        raise CodecError(f"{where}: the blob's header is damaged (dtype code {code}, {ndim} dimensions)")
+    shape = struct.unpack_from(f"<{ndim}I", blob, _HEADER.size)
+    start = _HEADER.size + 4 * ndim
+    expected = start + dtype.itemsize * int(np.prod(shape, dtype=object)) if ndim else start + dtype.itemsize
+    if len(blob) != expected:
+        kind = "truncated" if len(blob) < expected else "too long"
+        raise CodecError(f"{where}: the blob is {kind} ({len(blob)} bytes, shape {shape} needs {expected})")
+    if zlib.crc32(memoryview(blob)[_HEADER.size :]) != checksum:
+        raise CodecError(f"{where}: the blob's checksum is wrong; delete the recording and ingest it again")
+    return np.frombuffer(blob, dtype=dtype, offset=start).reshape(shape)
+
+
+def encode_mask(mask: BoolArray) -> bytes:
+    """A mask ``[H, W]`` as run lengths."""
+    if mask.ndim != 2:
+        raise CodecError(f"a mask has two dimensions, not {mask.ndim}")
+    flat = np.ascontiguousarray(mask, dtype=np.bool_).ravel()
+    edges = np.flatnonzero(flat[1:] != flat[:-1]) + 1
+    bounds = np.concatenate([[0], edges, [flat.size]])
+    runs = np.diff(bounds)
+    if flat.size and flat[0]:
+        runs = np.concatenate([[0], runs])
+    return encode_array(np.concatenate([mask.shape, runs]).astype("<u4"), magic=MASK_MAGIC)
+
+
+def decode_mask(blob: bytes, where: str) -> BoolArray:
+    """The mask ``[H, W]`` of a blob. Raises CodecError."""
+    numbers = decode_array(blob, where, magic=MASK_MAGIC)
+    if numbers.ndim != 1 or len(numbers) < 2 or numbers.dtype != np.dtype("<u4"):
+        raise CodecError(f"{where}: the mask has no size")
+    height, width = int(numbers[0]), int(numbers[1])
+    runs = numbers[2:].astype(np.int64)
+    if int(runs.sum()) != height * width:
+        raise CodecError(f"{where}: the mask's runs do not fill {width}x{height} pixels")
+    return np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(height, width)
+
+
+def encode_keypoints(keypoints: Keypoints) -> bytes:
+    """Keypoints packed as float32 ``[n, 9]``: x, y, size, angle, response, laplacian, X, Y, Z (camera frame, m)."""
+    features = keypoints.features
+    packed = np.empty((len(features), 9), dtype=np.float32)
+    packed[:, 0:2] = features.xy
+    packed[:, 2] = features.size
+    packed[:, 3] = features.angle
+    packed[:, 4] = features.response
+    packed[:, 5] = features.laplacian
+    packed[:, 6:9] = keypoints.points
+    return encode_array(packed)
+
+
+def decode_keypoints(
+    blob: bytes, descriptors: npt.NDArray[np.generic] | None, object_index: IntArray, where: str
+) -> Keypoints:
+    """Keypoints of a packed row. `descriptors` None leaves them out (shape ``[n, 0]``). Raises CodecError."""
+    packed = decode_array(blob, where)
+    if packed.ndim != 2 or packed.shape[1] != 9 or packed.dtype != np.dtype("<f4"):
+        raise CodecError(f"{where}: keypoints are float32 [n, 9], not {packed.dtype} {packed.shape}")
+    count = len(packed)
+    if descriptors is None:
+        descriptors = np.empty((count, 0), dtype=np.float32)
+    if descriptors.ndim != 2 or len(descriptors) != count or len(object_index) != count:
+        raise CodecError(
+            f"{where}: {count} keypoints, descriptors {descriptors.shape}, {len(object_index)} in object slices"
+        )
+    columns: Float32Array = np.ascontiguousarray(packed.T, dtype=np.float32)
+    features = Features(
+        xy=np.ascontiguousarray(packed[:, 0:2], dtype=np.float32),
+        size=columns[2],
+        angle=columns[3],
+        response=columns[4],
+        laplacian=columns[5].astype(np.int8),
+        descriptors=descriptors,
+    )
+    return Keypoints(features, object_index, np.ascontiguousarray(packed[:, 6:9], dtype=np.float32))
+
+
+def image_format(data: bytes | None) -> str:
+    """``png``, ``jpeg`` or ``""`` by the first bytes of a file."""
+    if data is None:
+        return ""
+    if data.startswith(b"\x89PNG\r\n\x1a\n"):
+        return "png"
+    return "jpeg" if data.startswith(b"\xff\xd8\xff") else ""

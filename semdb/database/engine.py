@@ -1,0 +1,119 @@
+"""Connections: one engine per URL, set up the same way on SQLite and on servers of the MySQL protocol."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import URL, Connection, Engine, create_engine, event
+from sqlalchemy.engine import make_url
+from sqlalchemy.exc import ArgumentError
+
+from semdb.errors import DatabaseError, UsageError
+
+CONNECT_TIMEOUT_S = 5
+BUSY_TIMEOUT_MS = 30_000
+WRITE = "semdb_write"  # execution option: the transaction will write
+_SERVER_SETTINGS = (
+    "SET SESSION time_zone = '+00:00'",
+    "SET SESSION sql_mode = 'STRICT_TRANS_TABLES,NO_ZERO_DATE,ERROR_FOR_DIVISION_BY_ZERO,NO_ENGINE_SUBSTITUTION'",
+)
+
+
+def parse_url(url: str) -> URL:
+    """The URL, its driver made explicit. Raises UsageError for anything but SQLite files and MySQL servers."""
+    hint = "use sqlite:///FILE or mysql+pymysql://USER:PASSWORD@HOST/SCHEMA"
+    try:
+        parsed = make_url(url)
+    except (ArgumentError, ValueError) as error:
+        raise UsageError(f"the database URL cannot be read; {hint}") from error
+    backend = parsed.get_backend_name()
+    if backend == "sqlite":
+        if parsed.database in (None, "", ":memory:"):
+            raise UsageError(f"a database in memory is not supported, it needs a file; {hint}")
+        return parsed.set(drivername="sqlite")
+    if backend in ("mysql", "mariadb"):
+        if not parsed.database:
+            raise UsageError(f"the database URL {safe_url(parsed)} names no schema; {hint}")
+        return parsed.set(drivername="mysql+pymysql")
+    raise UsageError(f"databases of the kind {backend!r} are not supported; {hint}")
+
+
+def safe_url(url: URL) -> str:
+    """The URL for messages, without the password."""
+    return url.render_as_string(hide_password=True)
+
+
+def make_engine(url: str, *, read_timeout_s: int | None = None) -> Engine:
+    """An engine for `url`. Connects only when used. Raises UsageError for a URL that cannot be used."""
+    parsed = parse_url(url)
+    if parsed.get_backend_name() == "sqlite":
+        return _sqlite_engine(parsed)
+    return _server_engine(parsed, read_timeout_s)
+
+
+def _sqlite_engine(url: URL) -> Engine:
+    engine = create_engine(url, connect_args={"timeout": BUSY_TIMEOUT_MS / 1000, "check_same_thread": False})
+
+    @event.listens_for(engine, "connect")
+    def _configure(connection: Any, _record: Any) -> None:
+        connection.isolation_level = None  # the driver's own BEGIN leaves DDL and reads outside of transactions
+        cursor = connection.cursor()
+        cursor.execute(f"PRAGMA busy_timeout = {BUSY_TIMEOUT_MS}")
+        cursor.execute("PRAGMA foreign_keys = ON")
+        cursor.execute("PRAGMA journal_mode = WAL")
+        cursor.execute("PRAGMA synchronous = NORMAL")
+        cursor.close()
+
+    @event.listens_for(engine, "begin")
+    def _begin(connection: Connection) -> None:
+        # A transaction that reads first and writes later could not wait for another writer: it fails at once.
+        writes = connection.get_execution_options().get(WRITE, False)
+        connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
+
+    return engine
+
+
+def _server_engine(url: URL, read_timeout_s: int | None) -> Engine:
+    arguments: dict[str, Any] = {"connect_timeout": CONNECT_TIMEOUT_S, "charset": "utf8mb4"}
+    if read_timeout_s is not None:
+        arguments["read_timeout"] = read_timeout_s
+    engine = create_engine(
+        url,
+        connect_args=arguments,
+        pool_pre_ping=True,
+        pool_recycle=3600,
+        isolation_level="REPEATABLE READ",
+    )
+
+    @event.listens_for(engine, "connect")
+    def _configure(connection: Any, record: Any) -> None:
+        with connection.cursor() as cursor:
+            for statement in _SERVER_SETTINGS:
+                cursor.execute(statement)
+            cursor.execute("SHOW SESSION VARIABLES WHERE Variable_name IN ('wsrep_sync_wait', 'max_allowed_packet')")
+            variables = dict(cursor.fetchall())
+            if "wsrep_sync_wait" in variables:  # reads see what this cluster has committed
+                cursor.execute("SET SESSION wsrep_sync_wait = 1")
+            record.info["max_allowed_packet"] = int(variables["max_allowed_packet"])
+
+    return engine
+
+
+def check_packet(connection: Connection, size: int, what: str) -> None:
+    """Raises DatabaseError when a statement with `size` bytes of values is more than the server takes."""
+    limit = connection.info.get("max_allowed_packet")
+    if limit is not None and size > limit:
+        raise DatabaseError(
+            f"{what} needs a statement of {size / 2**20:.1f} MiB, and the server takes {limit / 2**20:.1f} MiB: "
+            f"raise max_allowed_packet on the server (SET GLOBAL max_allowed_packet = {_next_power(size)})"
+        )
+
+
+def _next_power(size: int) -> int:
+    return 1 << (size - 1).bit_length()
+
+
+def sqlite_path(url: URL) -> Path | None:
+    """The file of a SQLite URL, None for a server."""
+    return Path(url.database or "") if url.get_backend_name() == "sqlite" else None

@@ -1,0 +1,109 @@
+"""Ids of rows that many keyframes share (models, categories, cameras): found or made, and remembered.
+
+They are made in small transactions of their own, so that two writers never wait for each other over them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from sqlalchemy import Connection, Engine, Table, insert, select
+from sqlalchemy.exc import IntegrityError
+
+from semdb.database import retry
+from semdb.database.tables import NAME_LENGTH, cameras, categories, models
+from semdb.errors import DatabaseError, UsageError
+from semdb.types import Camera, ModelInfo
+
+IN_CHUNK = 500
+
+
+def check_name(what: str, name: str) -> str:
+    """`name`, if it can be stored and compared alike on all servers; UsageError if not."""
+    if not name or name != name.strip() or len(name) > NAME_LENGTH or not name.isprintable():
+        raise UsageError(
+            f"{name!r} cannot be the name of a {what}: 1 to {NAME_LENGTH} printable characters are needed, "
+            "no space at either end"
+        )
+    return name
+
+
+def digest(values: Mapping[str, Any]) -> str:
+    """SHA-256 of `values` as canonical JSON: the key under which equal rows are one row."""
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+
+
+def model_row(info: ModelInfo) -> dict[str, Any]:
+    row = {"role": info.role, "name": info.name, "sha256": info.sha256, "config": info.config}
+    return {**row, "digest": digest(row)}
+
+
+def camera_row(camera: Camera) -> dict[str, Any]:
+    row: dict[str, Any] = {
+        "model": camera.model,
+        "width": int(camera.width),
+        "height": int(camera.height),
+        **{name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")},
+        "distortion": json.dumps([float(value) for value in camera.distortion]),
+    }
+    return {**row, "digest": digest(row)}
+
+
+class SharedIds:
+    """The ids of models, categories and cameras. Safe to share between threads; `forget` after a deletion."""
+
+    def __init__(self, engine: Engine) -> None:
+        self._engine = engine
+        self._known: dict[tuple[str, str], int] = {}
+
+    def forget(self) -> None:
+        self._known = {}
+
+    def models(self, infos: Iterable[ModelInfo]) -> dict[ModelInfo, int]:
+        wanted = {info: model_row(info) for info in infos}
+        ids = self._ensure(models, "digest", list(wanted.values()))
+        return {info: ids[row["digest"]] for info, row in wanted.items()}
+
+    def categories(self, names: Iterable[str]) -> dict[str, int]:
+        wanted = sorted({check_name("category", name) for name in names})
+        return self._ensure(categories, "name", [{"name": name} for name in wanted])
+
+    def camera(self, camera: Camera) -> int:
+        row = camera_row(camera)
+        return self._ensure(cameras, "digest", [row])[row["digest"]]
+
+    def _ensure(self, table: Table, key: str, rows: list[dict[str, Any]]) -> dict[str, int]:
+        missing = [row for row in rows if (table.name, row[key]) not in self._known]
+        if missing:
+            for row_key, row_id in self._make(table, key, missing).items():
+                self._known[table.name, row_key] = row_id
+        return {row[key]: self._known[table.name, row[key]] for row in rows}
+
+    def _make(self, table: Table, key: str, rows: list[dict[str, Any]]) -> dict[str, int]:
+        def find(connection: Connection) -> dict[str, int]:
+            keys = [row[key] for row in rows]
+            found: dict[str, int] = {}
+            for start in range(0, len(keys), IN_CHUNK):
+                chunk = keys[start : start + IN_CHUNK]
+                query = select(table.c[key], table.c.id).where(table.c[key].in_(chunk))
+                found.update((name, row_id) for name, row_id in connection.execute(query))
+            return found
+
+        def make(connection: Connection) -> None:
+            found = find(connection)
+            for row in rows:
+                if row[key] not in found:
+                    connection.execute(insert(table), row)
+
+        for _ in range(10):  # another writer may make the same rows at the same time: then they are there
+            found = retry.read(self._engine, find)
+            if all(row[key] in found for row in rows):
+                return found
+            try:
+                retry.write(self._engine, make)
+            except IntegrityError:
+                continue
+        raise DatabaseError(f"rows of {table.name} could not be made: other writers were always faster; try again")

@@ -1,0 +1,239 @@
+"""Maps, their models, and the plan of a recording: which keyframes are to be stored, and which are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from sqlalchemy import Connection, Engine, Row, func, insert, select, update
+from sqlalchemy.exc import IntegrityError
+
+from semdb.database import retry
+from semdb.database.ids import SharedIds, check_name
+from semdb.database.records import (
+    FailedItem,
+    ItemState,
+    MapInfo,
+    PlannedRecording,
+    RecordingPlan,
+    RecordingState,
+)
+from semdb.database.tables import ingest_items, keyframes, map_models, maps, models, recordings
+from semdb.errors import DatabaseError, NotFoundError, ProvenanceError, UsageError
+from semdb.types import ModelInfo
+
+ROLES = ("detector", "encoder", "features")
+
+
+def ensure_map(engine: Engine, name: str) -> int:
+    """The id of the map `name`, made when it is not there."""
+    check_name("map", name)
+    for _ in range(10):
+        found = retry.read(engine, lambda c: c.execute(select(maps.c.id).where(maps.c.name == name)).scalar())
+        if found is not None:
+            return int(found)
+        try:
+            retry.write(engine, lambda c: c.execute(insert(maps), {"name": name}))
+        except IntegrityError:  # another process made it between the two statements
+            continue
+    raise DatabaseError(f"the map {name!r} could not be made; try again")
+
+
+def list_maps(engine: Engine) -> list[MapInfo]:
+    """All maps by id."""
+    count_recordings = (
+        select(func.count()).select_from(recordings).where(recordings.c.map_id == maps.c.id).scalar_subquery()
+    )
+    count_keyframes = (
+        select(func.count())
+        .select_from(keyframes.join(recordings))
+        .where(recordings.c.map_id == maps.c.id)
+        .scalar_subquery()
+    )
+    query = select(maps.c.id, maps.c.name, count_keyframes, count_recordings).order_by(maps.c.id)
+    return retry.read(engine, lambda c: [MapInfo(*row) for row in c.execute(query)])
+
+
+def map_model_ids(connection: Connection, map_id: int) -> dict[ModelInfo, int]:
+    """The models that describe a map, by role, with their ids."""
+    query = (
+        select(models.c.role, models.c.name, models.c.sha256, models.c.config, models.c.id)
+        .join(map_models, map_models.c.model_id == models.c.id)
+        .where(map_models.c.map_id == map_id)
+        .order_by(models.c.role)
+    )
+    return {ModelInfo(*row[:4]): row[4] for row in connection.execute(query)}
+
+
+def check_models(stored: Iterable[ModelInfo], given: Iterable[ModelInfo], what: str) -> None:
+    """Raises ProvenanceError, naming both, unless every role of `stored` is the same model in `given`."""
+    by_role = {model.role: model for model in given}
+    for model in stored:
+        other = by_role.get(model.role)
+        if other != model:
+            raise ProvenanceError(
+                f"{what} is described by the {model.role} {_describe(model)}, not by "
+                f"{_describe(other) if other else 'none'}: use the same models, or another map (--map)"
+            )
+
+
+def _describe(model: ModelInfo) -> str:
+    details = [f"sha256 {model.sha256[:12]}"] if model.sha256 else []
+    if model.config not in ("", "{}"):
+        details.append(model.config)
+    return f"{model.name} ({', '.join(details)})" if details else model.name
+
+
+def plan_recording(
+    engine: Engine, ids: SharedIds, map_id: int, plan: RecordingPlan, infos: Sequence[ModelInfo]
+) -> PlannedRecording:
+    """Record the plan, or find it: the same plan again returns what is left.
+
+    Raises UsageError when a recording of that name has another plan, ProvenanceError when the map is described by
+    other models, NotFoundError without such a map.
+    """
+    _check_plan(plan, infos)
+    model_ids = ids.models(infos)
+
+    def work(connection: Connection) -> PlannedRecording:
+        map_name = connection.execute(select(maps.c.name).where(maps.c.id == map_id)).scalar()
+        if map_name is None:
+            raise NotFoundError(f"there is no map with the id {map_id}")
+        claimed = map_model_ids(connection, map_id)
+        check_models(claimed, infos, f"the map {map_name!r}")
+        query = select(recordings).where(recordings.c.map_id == map_id, recordings.c.name == plan.name)
+        row = connection.execute(query).one_or_none()
+        if row is not None:
+            return _resume(connection, row, plan, map_name)
+        if not claimed:
+            rows = [{"map_id": map_id, "role": info.role, "model_id": model_ids[info]} for info in infos]
+            connection.execute(insert(map_models), rows)
+        return _insert_plan(connection, map_id, plan)
+
+    for _ in range(10):  # another process may plan the same recording, or claim the map, at the same time
+        try:
+            return retry.write(engine, work)
+        except IntegrityError:
+            continue
+    raise DatabaseError(f"the recording {plan.name!r} could not be planned; try again")
+
+
+def _check_plan(plan: RecordingPlan, infos: Sequence[ModelInfo]) -> None:
+    check_name("recording", plan.name)
+    if not plan.fingerprint or len(plan.fingerprint) > 64:
+        raise UsageError("the fingerprint of a recording has 1 to 64 characters")
+    if len(set(plan.frame_indexes)) != len(plan.frame_indexes):
+        raise UsageError(f"the plan of the recording {plan.name!r} names a frame twice")
+    if tuple(sorted(info.role for info in infos)) != ROLES:
+        raise UsageError(f"a recording is described by one model of each role {ROLES}")
+
+
+def _insert_plan(connection: Connection, map_id: int, plan: RecordingPlan) -> PlannedRecording:
+    values = {
+        "map_id": map_id,
+        "name": plan.name,
+        "format": plan.format,
+        "source": plan.source,
+        "fingerprint": plan.fingerprint,
+        "frame_count": plan.frame_count,
+        "state": RecordingState.PLANNED.value,
+    }
+    key = connection.execute(insert(recordings), values).inserted_primary_key
+    if key is None:
+        raise DatabaseError("the database gave no id for a new recording")
+    recording_id = int(key[0])
+    indexes = tuple(sorted(plan.frame_indexes))
+    if indexes:
+        item = {"recording_id": recording_id, "state": ItemState.PENDING.value, "attempts": 0}
+        connection.execute(insert(ingest_items), [{**item, "frame_index": index} for index in indexes])
+    return PlannedRecording(recording_id, map_id, indexes, (), ())
+
+
+def _resume(connection: Connection, row: Row[Any], plan: RecordingPlan, map_name: str) -> PlannedRecording:
+    advice = "run `semdb delete` for it first, or give the new one another name (--name)"
+    name = f"the recording {plan.name!r} of the map {map_name!r}"
+    if row.state == RecordingState.DELETING:
+        raise UsageError(f"{name} is being deleted: let `semdb delete` finish")
+    for what, old, new in (
+        ("format", row.format, plan.format),
+        ("number of frames", row.frame_count, plan.frame_count),
+        ("fingerprint", row.fingerprint, plan.fingerprint),
+    ):
+        if old != new:
+            raise UsageError(f"{name} is stored already and is another one: its {what} is {old}, not {new}; {advice}")
+    query = select(ingest_items.c.frame_index, ingest_items.c.state).where(ingest_items.c.recording_id == row.id)
+    states = {row.frame_index: row.state for row in connection.execute(query.order_by(ingest_items.c.frame_index))}
+    if set(states) != set(plan.frame_indexes):
+        only_old, only_new = (
+            sorted(set(states) - set(plan.frame_indexes)),
+            sorted(set(plan.frame_indexes) - set(states)),
+        )
+        raise UsageError(
+            f"{name} is stored already with other keyframes: {len(states)} planned then, {len(plan.frame_indexes)} now "
+            f"(only then: {_few(only_old)}; only now: {_few(only_new)}); {advice}"
+        )
+    return PlannedRecording(
+        row.id,
+        row.map_id,
+        tuple(index for index, state in states.items() if state not in (ItemState.DONE, ItemState.DELETED)),
+        tuple(index for index, state in states.items() if state == ItemState.DONE),
+        tuple(index for index, state in states.items() if state == ItemState.FAILED),
+    )
+
+
+def _few(indexes: Sequence[int]) -> str:
+    shown = ", ".join(str(index) for index in indexes[:5])
+    return (shown + (", ..." if len(indexes) > 5 else "")) or "none"
+
+
+def fail_item(engine: Engine, recording_id: int, frame_index: int, error: str) -> None:
+    """Note that a keyframe could not be described or stored. A keyframe that is stored stays so."""
+    statement = (
+        update(ingest_items)
+        .where(
+            ingest_items.c.recording_id == recording_id,
+            ingest_items.c.frame_index == frame_index,
+            ingest_items.c.state.not_in([ItemState.DONE.value, ItemState.DELETED.value]),
+        )
+        .values(
+            state=ItemState.FAILED.value,
+            attempts=ingest_items.c.attempts + 1,
+            error=error[:4000],
+            worker=None,
+            lease_until=None,
+        )
+    )
+    retry.write(engine, lambda c: c.execute(statement))
+
+
+def failed_items(engine: Engine, recording_id: int | None = None) -> list[FailedItem]:
+    """The keyframes that failed, of one recording or of all."""
+    item = ingest_items.c
+    query = select(item.recording_id, item.frame_index, item.attempts, item.error)
+    query = query.where(item.state == ItemState.FAILED.value).order_by(item.recording_id, item.frame_index)
+    if recording_id is not None:
+        query = query.where(item.recording_id == recording_id)
+    return retry.read(engine, lambda c: [FailedItem(*row[:3], row[3] or "") for row in c.execute(query)])
+
+
+def finish_recording(engine: Engine, recording_id: int) -> RecordingState:
+    """Mark a recording complete when no keyframe of its plan is left to try. Returns its state.
+
+    Keyframes that failed do not hinder: they are counted in the status. Raises NotFoundError.
+    """
+
+    def work(connection: Connection) -> RecordingState:
+        state = connection.execute(select(recordings.c.state).where(recordings.c.id == recording_id)).scalar()
+        if state is None:
+            raise NotFoundError(f"there is no recording with the id {recording_id}")
+        left = select(func.count()).where(
+            ingest_items.c.recording_id == recording_id,
+            ingest_items.c.state.in_([ItemState.PENDING.value, ItemState.RUNNING.value]),
+        )
+        if connection.execute(left).scalar() or state in (RecordingState.COMPLETE, RecordingState.DELETING):
+            return RecordingState(state)
+        values = {"state": RecordingState.COMPLETE.value, "finished_at": func.current_timestamp()}
+        connection.execute(update(recordings).where(recordings.c.id == recording_id).values(values))
+        return RecordingState.COMPLETE
+
+    return retry.write(engine, work)

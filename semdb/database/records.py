@@ -1,0 +1,164 @@
+"""What the store takes and returns: frozen values, never rows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+
+from semdb.types import Camera, Description, Float32Array, FloatArray, Keypoints, ObjectGeometry
+
+
+class RecordingState(StrEnum):
+    PLANNED = "planned"
+    INGESTING = "ingesting"
+    COMPLETE = "complete"
+    DELETING = "deleting"
+
+
+class ItemState(StrEnum):
+    PENDING = "pending"
+    RUNNING = "running"
+    DONE = "done"
+    FAILED = "failed"
+    DELETED = "deleted"  # its keyframe was deleted on purpose: another ingest does not bring it back
+
+
+class ChangeKind(StrEnum):
+    ADDED = "added"
+    DELETED = "deleted"
+    REDESCRIBED = "redescribed"
+
+
+@dataclass(frozen=True, slots=True)
+class MapInfo:
+    id: int
+    name: str
+    keyframes: int
+    recordings: int
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingPlan:
+    """What is to be ingested. `fingerprint` (at most 64 characters) tells recordings of one name apart."""
+
+    name: str
+    format: str
+    source: str
+    frame_count: int
+    fingerprint: str
+    frame_indexes: tuple[int, ...]  # of the keyframes
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedRecording:
+    """`pending`: frame indexes that are not stored yet, ascending, the `failed` of earlier runs among them."""
+
+    recording_id: int
+    map_id: int
+    pending: tuple[int, ...]
+    stored: tuple[int, ...]
+    failed: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframeRecord:
+    """One keyframe with all that is stored of it. `image_bytes` and `depth_bytes` are the files as recorded."""
+
+    frame_index: int
+    timestamp_ns: int | None
+    camera: Camera
+    world_from_camera: FloatArray  # [4, 4]
+    image_bytes: bytes
+    depth_bytes: bytes | None
+    depth_scale: float | None
+    depth_registration: str
+    description: Description
+
+
+@dataclass(frozen=True, slots=True)
+class WriteResult:
+    keyframe_id: int
+    created: bool  # False: the keyframe was there before
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingStatus:
+    recording_id: int
+    map_id: int
+    map: str
+    name: str
+    format: str
+    source: str
+    state: RecordingState
+    frame_count: int
+    items: Mapping[str, int]  # ItemState -> number of keyframes of the plan
+    keyframes: int
+    objects: int
+    keypoints: int
+    image_bytes: int  # colour and depth files
+
+
+@dataclass(frozen=True, slots=True)
+class FailedItem:
+    recording_id: int
+    frame_index: int
+    attempts: int
+    error: str
+
+
+@dataclass(frozen=True, slots=True)
+class ScoredKeyframe:
+    keyframe_id: int
+    class_score: float  # 0..1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredObject:
+    id: int
+    ordinal: int
+    category: str
+    score: float
+    box: Float32Array  # [4] x1, y1, x2, y2
+    geometry: ObjectGeometry
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredKeyframe:
+    id: int
+    map_id: int
+    recording_id: int
+    recording: str
+    frame_index: int
+    timestamp_ns: int | None
+    camera: Camera
+    world_from_camera: FloatArray  # [4, 4]
+    objects: tuple[StoredObject, ...]  # by ordinal
+    keypoints: Keypoints
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredImage:
+    """The files as recorded. Formats are ``png``, ``jpeg`` or ``""``; no depth: None, scale None."""
+
+    rgb: bytes
+    rgb_format: str
+    depth: bytes | None
+    depth_format: str
+    depth_scale: float | None
+    depth_registration: str
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    id: int
+    keyframe_id: int
+    kind: ChangeKind
+
+
+@dataclass(frozen=True, slots=True)
+class Deleted:
+    """What a deletion removed."""
+
+    recordings: int
+    keyframes: int

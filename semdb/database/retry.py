@@ -1,0 +1,106 @@
+"""The one place where a transaction is run, and run again when the database asks for it.
+
+Retried with back-off: deadlock (1213), lock timeout (1205), lost connection (2006, 2013), a cluster node that is
+not ready (1047), and a busy SQLite file. The work is given a fresh transaction each time, so it must not keep
+anything from an earlier attempt; all writes of semdb are idempotent, so a commit whose answer was lost is safe to
+repeat.
+"""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+from sqlalchemy import Connection, Engine
+from sqlalchemy.exc import DBAPIError, IntegrityError, SQLAlchemyError
+
+from semdb.database.engine import WRITE, safe_url
+from semdb.errors import DatabaseError
+
+T = TypeVar("T")
+ATTEMPTS = 8
+FIRST_DELAY_S = 0.05
+LONGEST_DELAY_S = 3.0
+RETRIED_CODES = frozenset({1213, 1205, 2006, 2013, 1047})
+# Nothing listens, no such host, access denied, no such schema: trying again does not help.
+_UNREACHABLE = {2003, 2005}
+_DENIED = {1044, 1045, 1049, 1698, 1142, 1227}
+
+
+def read(engine: Engine, work: Callable[[Connection], T]) -> T:
+    """The result of `work` in one read transaction (a consistent snapshot). Raises DatabaseError."""
+    return _run(engine, work, write=False)
+
+
+def write(engine: Engine, work: Callable[[Connection], T]) -> T:
+    """The result of `work` in one committed transaction. IntegrityError passes through; else DatabaseError."""
+    return _run(engine, work, write=True)
+
+
+def _run(engine: Engine, work: Callable[[Connection], T], *, write: bool) -> T:
+    delay = FIRST_DELAY_S
+    for attempt in range(1, ATTEMPTS + 1):
+        try:
+            with engine.connect().execution_options(**{WRITE: write}) as connection, connection.begin():
+                return work(connection)
+        except IntegrityError as error:
+            if error_code(error) != 1213:  # a certification failure may be reported on any statement
+                raise
+            failure: SQLAlchemyError = error
+        except DBAPIError as error:
+            if not is_transient(error):
+                raise explain(engine, error) from error
+            failure = error
+        except SQLAlchemyError as error:
+            raise explain(engine, error) from error
+        if attempt == ATTEMPTS:
+            raise explain(engine, failure, attempts=ATTEMPTS) from failure
+        time.sleep(delay * random.uniform(0.5, 1.0))
+        delay = min(delay * 2, LONGEST_DELAY_S)
+    raise AssertionError("unreachable")
+
+
+def error_code(error: SQLAlchemyError) -> int | None:
+    """The server's error number, None where there is none (SQLite)."""
+    arguments = getattr(getattr(error, "orig", None), "args", ())
+    return arguments[0] if arguments and isinstance(arguments[0], int) else None
+
+
+def is_transient(error: DBAPIError) -> bool:
+    """Whether the same transaction may succeed when it is run again."""
+    if error_code(error) in RETRIED_CODES:
+        return True
+    # The base class names are the result codes; extended codes such as SQLITE_BUSY_SNAPSHOT start with them.
+    name = getattr(error.orig, "sqlite_errorname", "") or ""
+    return name.startswith(("SQLITE_BUSY", "SQLITE_LOCKED"))
+
+
+def explain(engine: Engine, error: SQLAlchemyError, attempts: int = 1) -> DatabaseError:
+    """The error for people: which database, what it said, what to do."""
+    where = safe_url(engine.url)
+    reason = str(getattr(error, "orig", None) or error).splitlines()[0]
+    code = error_code(error)
+    name = getattr(getattr(error, "orig", None), "sqlite_errorname", "") or ""
+    if code in _UNREACHABLE:
+        advice = "does not answer: check that the server runs and that host and port of SEMDB_DATABASE_URL are right"
+    elif code in _DENIED:
+        advice = "refuses: check user, password and schema of SEMDB_DATABASE_URL, and the account's rights"
+    elif name == "SQLITE_CANTOPEN":
+        advice = "cannot be opened: check that its folder exists and can be written"
+    elif name == "SQLITE_NOTADB":
+        advice = "is not a database: check the path of SEMDB_DATABASE_URL"
+    elif name.startswith("SQLITE_CORRUPT"):
+        advice = "is damaged: restore it from a backup, or delete the file and ingest again"
+    elif name.startswith(("SQLITE_BUSY", "SQLITE_LOCKED")):
+        advice = "is held by another process: wait for it or end it"
+    elif name == "SQLITE_READONLY" or name.startswith("SQLITE_READONLY"):
+        advice = "cannot be written: check the rights of the file and its folder"
+    elif name == "SQLITE_FULL":
+        advice = "cannot grow: the disk is full"
+    elif code in RETRIED_CODES:
+        advice = f"failed {attempts} times in a row: the server is down or overloaded; run the command again"
+    else:
+        advice = "refused a statement"
+    return DatabaseError(f"the database {where} {advice} ({reason})")

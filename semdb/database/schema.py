@@ -1,0 +1,86 @@
+"""Which revision the schema has, and moving it: Alembic, called as a library, with scripts from inside the package."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+
+from sqlalchemy import Connection, Engine, inspect, text
+
+from semdb.database import retry
+from semdb.database.engine import WRITE, safe_url
+from semdb.errors import SchemaError
+
+# Ascending; the last one is what this version of semdb reads and writes. A test compares them with the scripts.
+REVISIONS = ("0001", "0002")
+HEAD = REVISIONS[-1]
+
+
+def current_revision(engine: Engine) -> str | None:
+    """The schema's revision, None where there is no semdb schema. Raises DatabaseError."""
+
+    def work(connection: Connection) -> str | None:
+        if not inspect(connection).has_table("alembic_version"):
+            return None
+        revision = connection.execute(text("SELECT version_num FROM alembic_version")).scalar()
+        return None if revision is None else str(revision)
+
+    return retry.read(engine, work)
+
+
+def check_schema(engine: Engine) -> None:
+    """Raises SchemaError unless the schema is exactly the one that this version of semdb knows."""
+    revision = current_revision(engine)
+    where = safe_url(engine.url)
+    if revision == HEAD:
+        return
+    if revision is None:
+        raise SchemaError(f"there is no semdb schema in {where}: run `semdb init`")
+    if revision in REVISIONS:
+        raise SchemaError(
+            f"the schema of {where} is revision {revision}, older than this semdb needs ({HEAD}): run `semdb init`"
+        )
+    raise SchemaError(
+        f"the schema of {where} is revision {revision}, which this semdb does not know (it knows {HEAD}): upgrade semdb"
+    )
+
+
+def upgrade(engine: Engine, revision: str = HEAD) -> None:
+    """Create the schema, or move it up to `revision`; nothing happens when it is there already.
+
+    On SQLite all of it is one transaction. Raises SchemaError for a schema that is newer than this semdb.
+    """
+    _refuse_unknown(engine)
+    _alembic(engine, "upgrade", revision)
+
+
+def downgrade(engine: Engine, revision: str = "base") -> None:
+    """Move the schema down to `revision`. ``base`` removes every table and all data. Raises SchemaError."""
+    _refuse_unknown(engine)
+    _alembic(engine, "downgrade", revision)
+
+
+def _refuse_unknown(engine: Engine) -> None:
+    revision = current_revision(engine)
+    if revision is not None and revision not in REVISIONS:
+        check_schema(engine)
+
+
+def _alembic(engine: Engine, command: str, revision: str) -> None:
+    from alembic import command as alembic_command
+    from alembic.config import Config
+
+    config = Config()
+    folder = Path(str(import_module("semdb.migrations").__file__)).parent
+    config.set_main_option("script_location", str(folder).replace("%", "%%"))
+
+    def work(connection: Connection) -> None:
+        config.attributes["connection"] = connection
+        getattr(alembic_command, command)(config, revision)
+
+    if engine.dialect.name == "sqlite":
+        retry.write(engine, work)
+    else:  # DDL commits by itself on these servers: Alembic records each step as it is done
+        with engine.connect().execution_options(**{WRITE: True}) as connection:
+            work(connection)
+            connection.commit()

@@ -1,0 +1,203 @@
+"""The store: what the rest of semdb sees of the database. Takes and returns frozen values, never rows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+from sqlalchemy import Engine, select
+
+from semdb.database import class_filter, deletion, planning, reading, reporting, retry, schema
+from semdb.database.engine import make_engine, parse_url, safe_url, sqlite_path
+from semdb.database.ids import SharedIds
+from semdb.database.records import (
+    Change,
+    Deleted,
+    FailedItem,
+    KeyframeRecord,
+    MapInfo,
+    PlannedRecording,
+    RecordingPlan,
+    RecordingState,
+    RecordingStatus,
+    ScoredKeyframe,
+    StoredImage,
+    StoredKeyframe,
+    WriteResult,
+)
+from semdb.database.tables import recordings
+from semdb.database.writing import KeyframeWriter
+from semdb.errors import NotFoundError, SchemaError
+from semdb.types import BoolArray, Float32Array, FloatArray, Localization, ModelInfo
+
+Progress = Callable[[int, int], None]
+
+
+def open_store(url: str, *, create: bool = False) -> Store:
+    """The store at `url`, its schema checked.
+
+    With `create` a SQLite file that is missing or empty is made; a server always needs `semdb init`. Raises
+    UsageError for a URL of another kind, DatabaseError when it does not answer, SchemaError for a schema that is
+    missing, older or newer.
+    """
+    parsed = parse_url(url)
+    path = sqlite_path(parsed)
+    if path is not None and not path.exists() and not create:
+        raise SchemaError(f"there is no database {safe_url(parsed)}: run `semdb init` or `semdb ingest` first")
+    engine = make_engine(url)
+    try:
+        if path is not None and create and schema.current_revision(engine) is None:
+            schema.upgrade(engine)
+        schema.check_schema(engine)
+    except BaseException:
+        engine.dispose()
+        raise
+    return Store(engine)
+
+
+class Store:
+    """Reads and writes of a semantic database. Safe to share between threads; close it, or use it in a ``with``."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self._ids = SharedIds(engine)
+        self._writer = KeyframeWriter(engine, self._ids)
+
+    def __enter__(self) -> Store:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self.engine.dispose()
+
+    @property
+    def url(self) -> str:
+        """The URL without its password."""
+        return safe_url(self.engine.url)
+
+    # maps and recordings
+
+    def ensure_map(self, name: str) -> int:
+        """The id of the map `name`, made when it is not there. Raises UsageError for an impossible name."""
+        return planning.ensure_map(self.engine, name)
+
+    def maps(self) -> list[MapInfo]:
+        """All maps by id."""
+        return planning.list_maps(self.engine)
+
+    def find_map(self, name: str) -> MapInfo:
+        """The map `name`. Raises NotFoundError, which names the maps there are."""
+        known = self.maps()
+        for info in known:
+            if info.name == name:
+                return info
+        names = ", ".join(info.name for info in known) or "none yet, run `semdb ingest` first"
+        raise NotFoundError(f"there is no map {name!r} in {self.url}; maps: {names}")
+
+    def map_models(self, map_id: int) -> tuple[ModelInfo, ...]:
+        """The models that describe a map: detector, encoder, features; empty for an empty map."""
+        return tuple(retry.read(self.engine, lambda c: planning.map_model_ids(c, map_id)))
+
+    def check_models(self, map_id: int, models: Iterable[ModelInfo]) -> None:
+        """Raises ProvenanceError, naming both, when the map is described by other models than `models`."""
+        planning.check_models(self.map_models(map_id), models, f"the map {map_id}")
+
+    def find_recording(self, map_id: int, name: str) -> int:
+        """The id of a recording. Raises NotFoundError."""
+        query = select(recordings.c.id).where(recordings.c.map_id == map_id, recordings.c.name == name)
+        found = retry.read(self.engine, lambda c: c.execute(query).scalar())
+        if found is None:
+            raise NotFoundError(f"there is no recording {name!r} in the map {map_id}")
+        return int(found)
+
+    def status(self, map_id: int | None = None) -> list[RecordingStatus]:
+        """The recordings of a map, or of all maps, with what is planned and stored."""
+        return reporting.status(self.engine, map_id)
+
+    # ingest
+
+    def plan_recording(self, map_id: int, plan: RecordingPlan, models: Sequence[ModelInfo]) -> PlannedRecording:
+        """Record what is to be ingested, or find what is left of it: see `planning.plan_recording`."""
+        return planning.plan_recording(self.engine, self._ids, map_id, plan, models)
+
+    def write_keyframe(self, recording_id: int, record: KeyframeRecord) -> WriteResult:
+        """Store one planned keyframe with all its rows in one transaction, once: see `KeyframeWriter.write`."""
+        return self._writer.write(recording_id, record)
+
+    def fail_item(self, recording_id: int, frame_index: int, error: str) -> None:
+        """Note that a planned keyframe could not be described or stored."""
+        planning.fail_item(self.engine, recording_id, frame_index, error)
+
+    def failed_items(self, recording_id: int | None = None) -> list[FailedItem]:
+        """The keyframes that failed, of one recording or of all."""
+        return planning.failed_items(self.engine, recording_id)
+
+    def finish_recording(self, recording_id: int) -> RecordingState:
+        """Mark a recording complete when nothing of its plan is left to try. Returns its state."""
+        return planning.finish_recording(self.engine, recording_id)
+
+    # reading
+
+    def class_filter(self, map_id: int, counts: Mapping[str, float], minimum_share: float) -> list[ScoredKeyframe]:
+        """Keyframes that show enough of the query's classes, best first: see `semdb.database.class_filter`."""
+        return class_filter.class_filter(self.engine, map_id, counts, minimum_share)
+
+    def class_scores(self, map_id: int, counts: Mapping[str, float]) -> list[ScoredKeyframe]:
+        """All keyframes of a map that share any class with the query, best first."""
+        return class_filter.class_filter(self.engine, map_id, counts, 0.0)
+
+    def keyframe_ids(self, map_id: int) -> list[int]:
+        """Ids of all keyframes of a map, ascending."""
+        return reading.keyframe_ids(self.engine, map_id)
+
+    def load_vectors(self, keyframe_ids: Sequence[int]) -> Float32Array:
+        """CNN vectors float32 ``[n, d]`` in the order of `keyframe_ids`. Raises NotFoundError, CodecError."""
+        return reading.load_vectors(self.engine, keyframe_ids)
+
+    def load_keyframes(self, keyframe_ids: Sequence[int], *, descriptors: bool = True) -> list[StoredKeyframe]:
+        """Keyframes in the order of `keyframe_ids`. Raises NotFoundError, CodecError."""
+        return reading.load_keyframes(self.engine, keyframe_ids, with_descriptors=descriptors)
+
+    def load_image(self, keyframe_id: int) -> StoredImage:
+        """The colour and depth files of a keyframe as recorded. Raises NotFoundError."""
+        return reading.load_image(self.engine, keyframe_id)
+
+    def load_masks(self, keyframe_id: int) -> tuple[BoolArray, ...]:
+        """Object masks ``[H, W]`` of a keyframe, by ordinal. Raises CodecError."""
+        return reading.load_masks(self.engine, keyframe_id)
+
+    def poses(self, map_id: int) -> tuple[list[int], FloatArray]:
+        """Ids (ascending) and poses ``[n, 4, 4]`` of all keyframes of a map."""
+        return reading.poses(self.engine, map_id)
+
+    def changes_since(self, map_id: int, change_id: int) -> list[Change]:
+        """Changes of a map's keyframes after `change_id` (0: all), ascending."""
+        return reading.changes_since(self.engine, map_id, change_id)
+
+    # deletion and log
+
+    def delete_recording(self, recording_id: int, progress: Progress | None = None) -> Deleted:
+        """Delete a recording with all that belongs to it. Raises NotFoundError."""
+        try:
+            return deletion.delete_recording(self.engine, recording_id, progress)
+        finally:
+            self._writer.forget()
+
+    def delete_map(self, map_id: int, progress: Progress | None = None) -> Deleted:
+        """Delete a map with all its recordings. Raises NotFoundError."""
+        try:
+            return deletion.delete_map(self.engine, map_id, progress)
+        finally:
+            self._writer.forget()
+
+    def delete_keyframes(self, keyframe_ids: Iterable[int], progress: Progress | None = None) -> int:
+        """Delete keyframes with all that belongs to them. Returns how many there were."""
+        try:
+            return deletion.delete_keyframes(self.engine, keyframe_ids, progress)
+        finally:
+            self._writer.forget()
+
+    def log_query(self, map_id: int, image: str, localization: Localization) -> int:
+        """Add a localization to the log of queries. Returns the id of the row."""
+        return reporting.log_query(self.engine, map_id, image, localization)

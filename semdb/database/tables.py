@@ -1,0 +1,238 @@
+"""The tables as SQLAlchemy Core sees them, for statements only: the schema itself comes from the migrations.
+
+A test compares this metadata with a migrated database, so the two cannot drift apart. What each column means is
+in docs/schema.md.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import (
+    BigInteger,
+    Column,
+    DateTime,
+    Double,
+    ForeignKey,
+    Index,
+    Integer,
+    LargeBinary,
+    MetaData,
+    String,
+    Table,
+    Text,
+    UniqueConstraint,
+    func,
+)
+from sqlalchemy.dialects.mysql import LONGBLOB, LONGTEXT
+
+NAMING = {
+    "ix": "ix_%(table_name)s_%(column_0_N_name)s",
+    "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+    "fk": "fk_%(table_name)s_%(column_0_name)s",
+    "pk": "pk_%(table_name)s",
+}
+metadata = MetaData(naming_convention=NAMING)
+
+# SQLite counts rows up only in a column of type INTEGER; MySQL's BLOB ends at 64 KiB, its TEXT too.
+Id = BigInteger().with_variant(Integer(), "sqlite")
+Blob = LargeBinary().with_variant(LONGBLOB(), "mysql", "mariadb")
+LongText = Text().with_variant(LONGTEXT(), "mysql", "mariadb")
+NAME_LENGTH = 255
+
+
+def _table(name: str, *columns: Any) -> Table:
+    """A table with the options of both servers: InnoDB, binary collation, row ids that are never used twice."""
+    return Table(
+        name,
+        metadata,
+        *columns,
+        mysql_engine="InnoDB",
+        mysql_charset="utf8mb4",
+        mysql_collate="utf8mb4_bin",
+        sqlite_autoincrement=any(isinstance(c, Column) and c.primary_key and c.name == "id" for c in columns),
+    )
+
+
+def _id() -> Column[int]:
+    return Column("id", Id, primary_key=True, autoincrement=True)
+
+
+def _ref(name: str, target: str, *, cascade: bool = True, **options: Any) -> Column[int]:
+    foreign_key = ForeignKey(target, ondelete="CASCADE" if cascade else None)
+    return Column(name, Id, foreign_key, nullable=False, autoincrement=False, **options)
+
+
+def _time(name: str) -> Column[Any]:
+    return Column(name, DateTime, nullable=False, server_default=func.current_timestamp())
+
+
+maps = _table("maps", _id(), Column("name", String(NAME_LENGTH), nullable=False, unique=True), _time("created_at"))
+
+models = _table(
+    "models",
+    _id(),
+    Column("role", String(32), nullable=False),
+    Column("name", String(NAME_LENGTH), nullable=False),
+    Column("sha256", String(64), nullable=False),
+    Column("config", LongText, nullable=False),
+    Column("digest", String(64), nullable=False, unique=True),
+)
+
+map_models = _table(
+    "map_models",
+    _ref("map_id", "maps.id", primary_key=True),
+    Column("role", String(32), primary_key=True),
+    _ref("model_id", "models.id", cascade=False, index=True),
+)
+
+recordings = _table(
+    "recordings",
+    _id(),
+    _ref("map_id", "maps.id"),
+    Column("name", String(NAME_LENGTH), nullable=False),
+    Column("format", String(32), nullable=False),
+    Column("source", Text, nullable=False),
+    Column("fingerprint", String(64), nullable=False),
+    Column("frame_count", Integer, nullable=False),
+    Column("state", String(16), nullable=False),
+    _time("created_at"),
+    Column("finished_at", DateTime),
+    UniqueConstraint("map_id", "name"),
+)
+
+cameras = _table(
+    "cameras",
+    _id(),
+    Column("model", String(32), nullable=False),
+    Column("width", Integer, nullable=False),
+    Column("height", Integer, nullable=False),
+    Column("fx", Double, nullable=False),
+    Column("fy", Double, nullable=False),
+    Column("cx", Double, nullable=False),
+    Column("cy", Double, nullable=False),
+    Column("distortion", Text, nullable=False),
+    Column("digest", String(64), nullable=False, unique=True),
+)
+
+keyframes = _table(
+    "keyframes",
+    _id(),
+    _ref("recording_id", "recordings.id"),
+    Column("frame_index", Integer, nullable=False),
+    Column("timestamp_ns", BigInteger),
+    _ref("camera_id", "cameras.id", cascade=False, index=True),
+    *(Column(name, Double, nullable=False) for name in ("qw", "qx", "qy", "qz", "tx", "ty", "tz")),
+    UniqueConstraint("recording_id", "frame_index"),
+)
+
+keyframe_images = _table(
+    "keyframe_images",
+    _ref("keyframe_id", "keyframes.id", primary_key=True),
+    Column("rgb_format", String(16), nullable=False),
+    Column("depth_format", String(16), nullable=False),
+    Column("depth_scale", Double),
+    Column("depth_registration", String(32), nullable=False),
+    Column("rgb_bytes", Integer, nullable=False),
+    Column("depth_bytes", Integer, nullable=False),
+    Column("rgb", Blob, nullable=False),
+    Column("depth", Blob),
+)
+
+cnn_vectors = _table(
+    "cnn_vectors",
+    _ref("keyframe_id", "keyframes.id", primary_key=True),
+    _ref("model_id", "models.id", cascade=False, primary_key=True, index=True),
+    Column("vector", Blob, nullable=False),
+)
+
+categories = _table("categories", _id(), Column("name", String(NAME_LENGTH), nullable=False, unique=True))
+
+objects = _table(
+    "objects",
+    _id(),
+    _ref("keyframe_id", "keyframes.id"),
+    Column("ordinal", Integer, nullable=False),
+    _ref("category_id", "categories.id", cascade=False, index=True),
+    _ref("model_id", "models.id", cascade=False, index=True),
+    Column("score", Double, nullable=False),
+    *(Column(name, Double, nullable=False) for name in ("x1", "y1", "x2", "y2")),
+    Column("pixel_area", Integer, nullable=False),
+    *(Column(f"{name}_{axis}", Double) for name in ("centroid", "extent") for axis in "xyz"),
+    Column("mask", Blob, nullable=False),
+    UniqueConstraint("keyframe_id", "ordinal"),
+)
+
+# map_id is repeated here so that the class filter reads this table alone; the index covers it.
+keyframe_categories = _table(
+    "keyframe_categories",
+    _ref("category_id", "categories.id", cascade=False, primary_key=True),
+    _ref("keyframe_id", "keyframes.id", primary_key=True, index=True),
+    _ref("model_id", "models.id", cascade=False, primary_key=True, index=True),
+    _ref("map_id", "maps.id"),
+    Column("count", Integer, nullable=False),
+    Index(None, "map_id", "category_id", "keyframe_id", "count"),
+)
+
+keypoints = _table(
+    "keypoints",
+    _ref("keyframe_id", "keyframes.id", primary_key=True),
+    _ref("model_id", "models.id", cascade=False, primary_key=True, index=True),
+    Column("count", Integer, nullable=False),
+    Column("count_3d", Integer, nullable=False),
+    Column("data", Blob, nullable=False),
+)
+
+descriptors = _table(
+    "descriptors",
+    _ref("keyframe_id", "keyframes.id", primary_key=True),
+    _ref("model_id", "models.id", cascade=False, primary_key=True, index=True),
+    Column("data", Blob, nullable=False),
+)
+
+object_features = _table(
+    "object_features",
+    _ref("object_id", "objects.id", primary_key=True),
+    _ref("model_id", "models.id", cascade=False, primary_key=True, index=True),
+    Column("start", Integer, nullable=False),
+    Column("count", Integer, nullable=False),
+)
+
+ingest_items = _table(
+    "ingest_items",
+    _ref("recording_id", "recordings.id", primary_key=True),
+    Column("frame_index", Integer, primary_key=True, autoincrement=False),
+    Column("state", String(16), nullable=False),
+    Column("attempts", Integer, nullable=False),
+    Column("error", Text),
+    Column("worker", String(NAME_LENGTH)),
+    Column("lease_until", DateTime),
+    Index(None, "state", "lease_until"),
+)
+
+keyframe_changes = _table(
+    "keyframe_changes",
+    _id(),
+    _ref("map_id", "maps.id"),
+    Column("keyframe_id", Id, nullable=False),
+    Column("kind", String(16), nullable=False),
+    _time("changed_at"),
+    Index(None, "map_id", "id"),
+)
+
+queries = _table(
+    "queries",
+    _id(),
+    _ref("map_id", "maps.id"),
+    _time("created_at"),
+    Column("image", Text, nullable=False),
+    Column("verdict", String(16), nullable=False),
+    *(Column(name, Double) for name in ("qw", "qx", "qy", "qz", "tx", "ty", "tz")),
+    Column("confidence", Double, nullable=False),
+    Column("inliers", Integer, nullable=False),
+    Column("stage", String(16), nullable=False),
+    Column("reason", Text, nullable=False),
+    Column("candidates", LongText, nullable=False),
+    Column("timing_ms", LongText, nullable=False),
+    Index(None, "map_id", "created_at"),
+)

@@ -1,0 +1,268 @@
+"""Writing a keyframe: all its rows in one transaction, once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from sqlalchemy import Connection, Engine, Table, insert, select, update
+from sqlalchemy.exc import IntegrityError
+
+from semdb.database import retry, tables
+from semdb.database.codecs import encode_array, encode_keypoints, encode_mask, image_format
+from semdb.database.engine import check_packet
+from semdb.database.ids import SharedIds
+from semdb.database.planning import check_models, map_model_ids
+from semdb.database.records import ChangeKind, ItemState, KeyframeRecord, RecordingState, WriteResult
+from semdb.errors import DatabaseError, NotFoundError, UsageError
+from semdb.geometry import quat_wxyz_from_rotation
+from semdb.types import Description, FloatArray, ModelInfo
+
+_STATEMENT_OVERHEAD = 4096  # bytes of a statement beside its blobs
+
+
+@dataclass(frozen=True, slots=True)
+class _Target:
+    """What every keyframe of a recording shares."""
+
+    map_id: int
+    map_name: str
+    model_ids: Mapping[ModelInfo, int]
+
+
+@dataclass(frozen=True, slots=True)
+class _Rows:
+    """The rows of a keyframe, encoded outside of the transaction, without the ids that it will get."""
+
+    keyframe: dict[str, Any]
+    image: dict[str, Any]
+    vector: dict[str, Any]
+    objects: list[dict[str, Any]]
+    slices: list[dict[str, Any]]  # by ordinal
+    categories: list[dict[str, Any]]
+    keypoints: dict[str, Any]
+    descriptors: dict[str, Any]
+
+
+class KeyframeWriter:
+    """Writes keyframes. Remembers what recordings share, so one long-lived writer is faster than many."""
+
+    def __init__(self, engine: Engine, ids: SharedIds) -> None:
+        self._engine = engine
+        self._ids = ids
+        self._targets: dict[int, _Target] = {}
+
+    def forget(self) -> None:
+        """Forget what was remembered: recordings may have been deleted."""
+        self._targets = {}
+        self._ids.forget()
+
+    def write(self, recording_id: int, record: KeyframeRecord) -> WriteResult:
+        """Store one planned keyframe; a keyframe that is there stays as it is.
+
+        Raises ProvenanceError for other models than the map's, NotFoundError without such a recording, UsageError
+        for a frame that is not in its plan or a description that contradicts itself, DatabaseError for a value
+        that is too large for the server or when the database gives up.
+        """
+        _check_description(record.description)
+        failure: IntegrityError | None = None
+        for _ in range(3):
+            target = self._target(recording_id)
+            check_models(target.model_ids, record.description.models, f"the map {target.map_name!r}")
+            rows = self._encode(target, record)
+            try:
+                return retry.write(self._engine, partial(_write, target=target, recording_id=recording_id, rows=rows))
+            except IntegrityError as error:
+                # Another writer stored the same keyframe, or a row that was remembered has been deleted.
+                failure = error
+                self.forget()
+        raise DatabaseError(
+            f"frame {record.frame_index} of the recording {recording_id} could not be stored ({failure})"
+        ) from failure
+
+    def _target(self, recording_id: int) -> _Target:
+        known = self._targets.get(recording_id)
+        if known is not None:
+            return known
+
+        def work(connection: Connection) -> _Target:
+            query = (
+                select(tables.maps.c.id, tables.maps.c.name, tables.recordings.c.state)
+                .join(tables.recordings, tables.recordings.c.map_id == tables.maps.c.id)
+                .where(tables.recordings.c.id == recording_id)
+            )
+            row = connection.execute(query).one_or_none()
+            if row is None or row.state == RecordingState.DELETING:
+                raise NotFoundError(
+                    f"there is no recording with the id {recording_id}: it was deleted, or never planned"
+                )
+            if row.state == RecordingState.PLANNED:
+                change = update(tables.recordings).where(tables.recordings.c.id == recording_id)
+                connection.execute(change.values(state=RecordingState.INGESTING.value))
+            return _Target(row.id, row.name, map_model_ids(connection, row.id))
+
+        target = retry.write(self._engine, work)
+        self._targets[recording_id] = target
+        return target
+
+    def _encode(self, target: _Target, record: KeyframeRecord) -> _Rows:
+        description = record.description
+        by_role = {info.role: model_id for info, model_id in target.model_ids.items()}
+        category_ids = self._ids.categories(detection.category for detection in description.detections)
+        index = description.keypoints.object_index
+        ordinals = np.arange(len(description.detections))
+        starts = np.searchsorted(_sort_key(index), ordinals, side="left")
+        ends = np.searchsorted(_sort_key(index), ordinals, side="right")
+        keyframe = {
+            "frame_index": record.frame_index,
+            "timestamp_ns": record.timestamp_ns,
+            "camera_id": self._ids.camera(record.camera),
+            **pose_columns(record.world_from_camera),
+        }
+        points = description.keypoints.points
+        features = {"model_id": by_role["features"]}
+        return _Rows(
+            keyframe=keyframe,
+            image=_image_row(record),
+            vector={
+                "model_id": by_role["encoder"],
+                "vector": encode_array(description.cnn_vector.astype(np.float32, copy=False)),
+            },
+            objects=_object_rows(description, category_ids, by_role["detector"]),
+            slices=[
+                {**features, "start": int(start), "count": int(end - start)}
+                for start, end in zip(starts, ends, strict=True)
+            ],
+            categories=[
+                {
+                    "category_id": category_ids[name],
+                    "model_id": by_role["detector"],
+                    "map_id": target.map_id,
+                    "count": count,
+                }
+                for name, count in sorted(description.category_counts.items())
+            ],
+            keypoints={
+                **features,
+                "count": len(description.keypoints),
+                "count_3d": int(np.isfinite(points).all(axis=1).sum()),
+                "data": encode_keypoints(description.keypoints),
+            },
+            descriptors={**features, "data": encode_array(description.keypoints.features.descriptors)},
+        )
+
+
+def pose_columns(world_from_camera: FloatArray) -> dict[str, float]:
+    """The columns qw, qx, qy, qz, tx, ty, tz of a pose ``[4, 4]``. Raises UsageError when it is not finite."""
+    if world_from_camera.shape != (4, 4) or not np.isfinite(world_from_camera).all():
+        raise UsageError("a keyframe needs a finite 4x4 pose")
+    numbers = [*quat_wxyz_from_rotation(world_from_camera[:3, :3]), *world_from_camera[:3, 3]]
+    return dict(zip(("qw", "qx", "qy", "qz", "tx", "ty", "tz"), map(float, numbers), strict=True))
+
+
+def _sort_key(object_index: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """`object_index` with the background (-1) after all objects, as keypoints are sorted."""
+    return np.where(object_index < 0, np.iinfo(np.int32).max, object_index)
+
+
+def _check_description(description: Description) -> None:
+    index = description.keypoints.object_index
+    key = _sort_key(index)
+    if (np.diff(key) < 0).any():
+        raise UsageError("the keypoints of a description are sorted by object, the background last; these are not")
+    if len(index) and index.max() >= len(description.detections):
+        raise UsageError(f"a keypoint lies on object {index.max()} of {len(description.detections)}")
+    if len(description.geometry) != len(description.detections):
+        raise UsageError("a description has one geometry per detection")
+    if description.cnn_vector.ndim != 1 or not np.isfinite(description.cnn_vector).all():
+        raise UsageError("the CNN vector of a description is one finite row")
+
+
+def _image_row(record: KeyframeRecord) -> dict[str, Any]:
+    return {
+        "rgb_format": image_format(record.image_bytes),
+        "depth_format": image_format(record.depth_bytes),
+        "depth_scale": None if record.depth_scale is None else float(record.depth_scale),
+        "depth_registration": record.depth_registration,
+        "rgb_bytes": len(record.image_bytes),
+        "depth_bytes": len(record.depth_bytes or b""),
+        "rgb": record.image_bytes,
+        "depth": record.depth_bytes,
+    }
+
+
+def _object_rows(description: Description, category_ids: Mapping[str, int], model_id: int) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = []
+    pairs = zip(description.detections, description.geometry, strict=True)
+    for ordinal, (detection, geometry) in enumerate(pairs):
+        row: dict[str, Any] = {
+            "ordinal": ordinal,
+            "category_id": category_ids[detection.category],
+            "model_id": model_id,
+            "score": float(detection.score),
+            "pixel_area": int(geometry.pixel_area),
+            "mask": encode_mask(detection.mask),
+        }
+        row.update(zip(("x1", "y1", "x2", "y2"), (float(v) for v in detection.box), strict=True))
+        for name in ("centroid", "extent"):
+            for axis, value in zip("xyz", getattr(geometry, name), strict=True):
+                row[f"{name}_{axis}"] = float(value) if np.isfinite(value) else None
+        rows.append(row)
+    return rows
+
+
+def _write(connection: Connection, target: _Target, recording_id: int, rows: _Rows) -> WriteResult:
+    frame_index = rows.keyframe["frame_index"]
+    keyframes, items = tables.keyframes.c, tables.ingest_items.c
+    there = select(keyframes.id).where(keyframes.recording_id == recording_id, keyframes.frame_index == frame_index)
+    keyframe_id = connection.execute(there).scalar()
+    done = (
+        update(tables.ingest_items)
+        .where(items.recording_id == recording_id, items.frame_index == frame_index)
+        .values(state=ItemState.DONE.value, attempts=items.attempts + 1, error=None, worker=None, lease_until=None)
+    )
+    if keyframe_id is not None:
+        connection.execute(done.where(items.state != ItemState.DONE.value))
+        return WriteResult(int(keyframe_id), created=False)
+    key = connection.execute(insert(tables.keyframes), {**rows.keyframe, "recording_id": recording_id})
+    if key.inserted_primary_key is None:
+        raise DatabaseError("the database gave no id for a new keyframe")
+    keyframe_id = int(key.inserted_primary_key[0])
+    _write_children(connection, keyframe_id, rows)
+    change = {"map_id": target.map_id, "keyframe_id": keyframe_id, "kind": ChangeKind.ADDED.value}
+    connection.execute(insert(tables.keyframe_changes), change)
+    if connection.execute(done).rowcount != 1:
+        raise UsageError(f"frame {frame_index} is not in the plan of the recording {recording_id}")
+    return WriteResult(keyframe_id, created=True)
+
+
+def _write_children(connection: Connection, keyframe_id: int, rows: _Rows) -> None:
+    key = {"keyframe_id": keyframe_id}
+    singles: tuple[tuple[Table, dict[str, Any]], ...] = (
+        (tables.keyframe_images, rows.image),
+        (tables.cnn_vectors, rows.vector),
+        (tables.keypoints, rows.keypoints),
+        (tables.descriptors, rows.descriptors),
+    )
+    for table, row in singles:
+        _check_size(connection, table, row, rows.keyframe["frame_index"])
+        connection.execute(insert(table), {**key, **row})
+    if not rows.objects:
+        return
+    for row in rows.objects:
+        _check_size(connection, tables.objects, row, rows.keyframe["frame_index"])
+    connection.execute(insert(tables.objects), [{**key, **row} for row in rows.objects])
+    connection.execute(insert(tables.keyframe_categories), [{**key, **row} for row in rows.categories])
+    query = select(tables.objects.c.ordinal, tables.objects.c.id).where(tables.objects.c.keyframe_id == keyframe_id)
+    object_ids = {row.ordinal: row.id for row in connection.execute(query)}
+    slices = [{**row, "object_id": object_ids[ordinal]} for ordinal, row in enumerate(rows.slices)]
+    connection.execute(insert(tables.object_features), slices)
+
+
+def _check_size(connection: Connection, table: Table, row: dict[str, Any], frame_index: int) -> None:
+    # The driver writes blobs in hexadecimal: two bytes per byte.
+    size = _STATEMENT_OVERHEAD + sum(2 * len(value) for value in row.values() if isinstance(value, bytes))
+    check_packet(connection, size, f"the {table.name} row of frame {frame_index}")
