@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from typing import Any
 
 from . import INGEST_TASK, app
@@ -11,17 +10,35 @@ from . import INGEST_TASK, app
 
 @app.task(name=INGEST_TASK)  # type: ignore[untyped-decorator]
 def ingest_recording(
-    path: str, map_name: str | None = None, name: str | None = None, options: Mapping[str, Any] | None = None
+    path: str, map_name: str = "default", name: str | None = None, options: Mapping[str, Any] | None = None
 ) -> list[dict[str, Any]]:
     """Ingest the recording at `path`, which the worker must see under that path.
 
-    `options` are those of `semdb.ingest.ingest_recordings`: keyframes, stride, camera. Returns its summaries.
-    Raises `SemdbError`, which Celery logs with the task; running the task again goes on where it stopped.
+    `options`: ``keyframes`` and ``stride`` (int), ``camera`` (text as for ``--camera``). Returns what was stored of
+    each recording. Raises `SemdbError`, which Celery logs; the task sent again goes on where this one stopped.
     """
     from pathlib import Path
 
-    from semdb.ingest import ingest_recordings
+    from semdb.errors import UsageError
+    from semdb.ingest import IngestOptions, ingest_recordings
+    from semdb.recordings import parse_camera
     from semdb.settings import Settings
 
-    summaries = ingest_recordings([Path(path)], Settings(), map_name=map_name, name=name, **dict(options or {}))
-    return [asdict(summary) for summary in summaries]
+    given = dict(options or {})
+    unknown = sorted(set(given) - {"keyframes", "stride", "camera"})
+    if unknown:
+        raise UsageError(f"{INGEST_TASK} has no option {unknown[0]!r}: keyframes, stride, camera")
+    if given.get("camera") is not None:
+        given["camera"] = parse_camera(given["camera"])
+    summaries = ingest_recordings([Path(path)], Settings(), IngestOptions(map_name=map_name, name=name, **given))
+    return [
+        {
+            "map": summary.map_name,
+            "recording": summary.recording,
+            "planned": summary.planned,
+            "already_stored": summary.already_stored,
+            "stored": summary.stored,
+            "failed": len(summary.failed),
+        }
+        for summary in summaries
+    ]

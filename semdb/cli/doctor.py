@@ -1,0 +1,147 @@
+"""`semdb doctor`: whether this installation can do its work, and what to do where it cannot."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from semdb.cli.options import JsonFlag, Overrides, settings_options
+
+if TYPE_CHECKING:
+    from semdb.settings import Settings
+
+LIBRARIES = ("numpy", "scipy", "numba", "opencv-contrib-python-headless", "onnxruntime", "poselib", "sqlalchemy")
+EXTRAS = {"worker": ("celery", "redis"), "torch": ("torch", "torchvision")}
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One finding: `state` is "ok", "info" or "problem"."""
+
+    state: str
+    what: str
+    text: str
+
+
+@settings_options(models=True)
+def command(overrides: Overrides, json: JsonFlag = False) -> None:
+    """Check versions, the database and its schema, folders and models; exit code 1 when something is wrong."""
+    from semdb.cli.output import print_json
+
+    settings = overrides.settings()
+    checks = [check for part in (versions, database, folders, models) for check in guarded(part, settings)]
+    if json:
+        print_json([{"state": check.state, "what": check.what, "text": check.text} for check in checks])
+    else:
+        width = max(len(check.what) for check in checks)
+        for check in checks:
+            print(f"{check.state:<8} {check.what:<{width}}  {check.text}")
+    problems = sum(check.state == "problem" for check in checks)
+    if problems:
+        print(f"semdb: {problems} problem{'s' if problems > 1 else ''} found", file=sys.stderr)
+        raise typer.Exit(1)
+
+
+def guarded(part: Callable[[Settings], Iterator[Check]], settings: Settings) -> Iterator[Check]:
+    """The findings of one part; an error of semdb ends it and is itself a finding."""
+    from semdb.errors import SemdbError
+
+    try:
+        yield from part(settings)
+    except SemdbError as error:
+        yield Check("problem", part.__name__, str(error))
+
+
+def versions(_settings: Settings) -> Iterator[Check]:
+    """Python, semdb and the libraries that do the work."""
+    from importlib import import_module
+    from importlib.metadata import PackageNotFoundError, version
+
+    import semdb
+
+    yield Check("ok", "semdb", f"{semdb.__version__} in {Path(semdb.__file__).parent}")
+    yield Check("ok", "python", f"{sys.version.split()[0]}, {os.cpu_count()} cores")
+    for name in LIBRARIES:
+        try:
+            import_module("cv2" if name.startswith("opencv") else name)
+            yield Check("ok", name, version(name))
+        except (ImportError, OSError, PackageNotFoundError) as error:
+            yield Check("problem", name, f"{error}: pip install --force-reinstall semdb")
+    for extra, names in EXTRAS.items():
+        try:
+            yield Check("ok", f"extra {extra}", ", ".join(f"{name} {version(name)}" for name in names))
+        except PackageNotFoundError:
+            yield Check("info", f"extra {extra}", f"not installed: pip install 'semdb[{extra}]'")
+
+
+def database(settings: Settings) -> Iterator[Check]:
+    """Whether the database answers, what it is, and whether its schema is the one that this version knows."""
+    from sqlalchemy import text
+
+    from semdb.database import retry, schema
+    from semdb.database.engine import make_engine, parse_url, safe_url, sqlite_path
+
+    url = parse_url(settings.database_url)
+    path = sqlite_path(url)
+    if path is not None and not path.exists():
+        yield Check("info", "database", f"{safe_url(url)} is not there yet; `semdb init` or the first ingest makes it")
+        if not os.access(path.parent if str(path.parent) else Path(), os.W_OK):
+            yield Check("problem", "database", f"the folder {path.parent.resolve()} cannot be written")
+        return
+    engine = make_engine(settings.database_url)
+    try:
+        statement = "SELECT sqlite_version()" if path is not None else "SELECT VERSION()"
+        version = retry.read(engine, lambda connection: str(connection.execute(text(statement)).scalar()))
+        kind = "SQLite" if path is not None else "server"
+        yield Check("ok", "database", f"{safe_url(url)} answers: {kind} {version}")
+        schema.check_schema(engine)
+        yield Check("ok", "schema", f"revision {schema.HEAD}")
+    finally:
+        engine.dispose()
+
+
+def folders(settings: Settings) -> Iterator[Check]:
+    """Whether compiled kernels, models and indexes can be kept."""
+    for what, folder in (
+        ("cache", settings.cache_dir.expanduser()),
+        ("NUMBA_CACHE_DIR", Path(os.environ["NUMBA_CACHE_DIR"]) if os.environ.get("NUMBA_CACHE_DIR") else None),
+    ):
+        if folder is None:
+            continue
+        nearest = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
+        if os.access(nearest, os.W_OK) and nearest.is_dir():
+            yield Check("ok", what, str(folder) + ("" if nearest == folder else " (made when needed)"))
+        else:
+            yield Check(
+                "problem", what, f"{folder} cannot be written; set {'SEMDB_CACHE_DIR' if what == 'cache' else what}"
+            )
+
+
+def models(settings: Settings) -> Iterator[Check]:
+    """Whether what the settings name can be loaded. ``auto`` depends on the map, so there is nothing to load."""
+    from semdb.errors import SemdbError
+    from semdb.perception.detectors import load_detector
+    from semdb.perception.encoders import load_encoder
+    from semdb.perception.features import load_features
+
+    loaders: dict[str, Callable[[str, Settings], object]] = {
+        "detector": load_detector,
+        "encoder": load_encoder,
+        "features": load_features,
+    }
+    for role, load in loaders.items():
+        spec = str(getattr(settings, role))
+        if spec == "auto":
+            yield Check("ok", role, "auto: that of the map, or of the recording")
+            continue
+        try:
+            load(spec, settings)
+            yield Check("ok", role, spec)
+        except SemdbError as error:
+            yield Check("problem", role, str(error))

@@ -1,0 +1,143 @@
+"""`semdb recording`: what was recognised, and what cannot be used and why."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from semdb.cli.options import CameraOption, JsonFlag
+
+if TYPE_CHECKING:
+    from semdb.recordings import DroppedFrame, Recording
+    from semdb.types import Camera
+
+NAMES_SHOWN = 3
+
+
+def command(
+    path: Annotated[Path, typer.Argument(help="Folder of a recording, or of a scene with several.")],
+    camera: CameraOption = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Do not decode every image; look at headers and file ends only.")
+    ] = False,
+    json: JsonFlag = False,
+) -> None:
+    """Say what a recording is: frames, usable ones, dropped ones and why, camera, depth scale, trajectory."""
+    from semdb.cli.output import print_json
+    from semdb.recordings import open_recordings, parse_camera
+
+    recordings = open_recordings(path, None if camera is None else parse_camera(camera))
+    if not quick:
+        for recording in recordings:
+            decode_all(recording)
+    if json:
+        print_json([as_json(recording, quick) for recording in recordings])
+        return
+    print("\n\n".join(as_text(recording, quick) for recording in recordings))
+
+
+def decode_all(recording: Recording) -> None:
+    """Decode every usable frame; those that fail go to `recording.decode_failures`."""
+    from semdb.cli.progress import Progress
+    from semdb.errors import FrameError
+
+    with Progress(f"decoding {recording.name}") as progress:
+        for done, entry in enumerate(recording.entries, 1):
+            try:
+                recording.read(entry)
+            except FrameError as error:
+                recording.note_decode_failure(entry, error)
+            progress.update(done, len(recording.entries))
+
+
+def counts(recording: Recording) -> dict[str, int]:
+    """Frames, those that can be used, and how many of these have what."""
+    broken = {failure.name for failure in recording.decode_failures}
+    usable = [entry for entry in recording.entries if entry.name not in broken]
+    return {
+        "frames": recording.total_frames,
+        "usable": len(usable),
+        "triples": sum(e.depth_path is not None and e.world_from_camera is not None for e in usable),
+        "with_depth": sum(entry.depth_path is not None for entry in usable),
+        "with_pose": sum(entry.world_from_camera is not None for entry in usable),
+        "with_masks": sum(entry.masks_path is not None for entry in usable),
+    }
+
+
+def as_json(recording: Recording, quick: bool) -> dict[str, Any]:
+    """What `--json` prints for one recording."""
+    camera = recording.camera
+    return {
+        "path": str(recording.path),
+        "name": recording.name,
+        "format": recording.format,
+        **counts(recording),
+        "decoded": not quick,
+        "dropped": [
+            {"name": dropped.name, "reason": dropped.reason}
+            for dropped in (*recording.dropped, *recording.decode_failures)
+        ],
+        "camera": {
+            "model": camera.model,
+            "width": camera.width,
+            "height": camera.height,
+            "fx": camera.fx,
+            "fy": camera.fy,
+            "cx": camera.cx,
+            "cy": camera.cy,
+            "distortion": list(camera.distortion),
+        },
+        "depth_scale": recording.depth_scale,
+        "depth_registration": recording.depth_registration,
+        "trajectory_length_m": recording.trajectory_length(),
+        "notes": list(recording.notes),
+    }
+
+
+def as_text(recording: Recording, quick: bool) -> str:
+    """What is printed for people."""
+    number = counts(recording)
+    dropped = (*recording.dropped, *recording.decode_failures)
+    triples = f"{number['triples']} with colour, depth and pose"
+    if number["triples"] != number["usable"]:
+        triples += f"; {number['with_depth']} with depth, {number['with_pose']} with a pose"
+    rows = [
+        ("recording", f"{recording.name} ({recording.format}) in {recording.path}"),
+        ("frames", f"{number['frames']}, usable {number['usable']} ({triples})"),
+        ("dropped", f"{len(dropped)}{' (images were not decoded: --quick)' if quick else ''}"),
+        *(("", line) for line in group_dropped(dropped)),
+        ("camera", describe_camera(recording.camera)),
+        ("depth scale", f"{recording.depth_scale:g} per metre"),
+        ("masks", f"{number['with_masks']} frames" if number["with_masks"] else "none"),
+        ("trajectory", f"{recording.trajectory_length():.2f} m"),
+        *(("note", note) for note in recording.notes),
+    ]
+    if recording.depth_registration:
+        rows.insert(-1, ("", f"depth is registered to the colour camera ({recording.depth_registration})"))
+    return "\n".join(f"{label:<12} {text}" for label, text in rows)
+
+
+def describe_camera(camera: Camera) -> str:
+    """One line: size, intrinsics in pixels, distortion."""
+    text = f"{camera.width}x{camera.height}, fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g}"
+    if camera.model == "PINHOLE":
+        return f"{text}, no distortion"
+    return f"{text}, distortion {', '.join(f'{value:g}' for value in camera.distortion)}"
+
+
+def group_dropped(dropped: Iterable[DroppedFrame]) -> list[str]:
+    """One line per reason: how many, why, and the first names. Reasons that differ in numbers only are one."""
+    groups: dict[str, list[DroppedFrame]] = {}
+    for frame in dropped:
+        key = re.sub(r"\d+(\.\d+)?", "#", frame.reason.replace(frame.name, ""))
+        groups.setdefault(key, []).append(frame)
+    lines = []
+    for frames in groups.values():
+        names = ", ".join(frame.name for frame in frames[:NAMES_SHOWN])
+        more = f" and {len(frames) - NAMES_SHOWN} more" if len(frames) > NAMES_SHOWN else ""
+        lines.append(f"{len(frames)} x {frames[0].reason}: {names}{more}")
+    return lines

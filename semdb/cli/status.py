@@ -1,0 +1,128 @@
+"""`semdb status` and `semdb retry`: what is stored of each recording, and trying again what failed."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from semdb.cli.options import JsonFlag, Overrides, settings_options
+
+if TYPE_CHECKING:
+    from semdb.database.records import FailedItem, RecordingStatus
+    from semdb.database.store import Store
+
+SECONDS_BETWEEN_LOOKS = 2.0
+ERRORS_SHOWN = 10
+COLUMNS = ("id", "map", "recording", "format", "state", "keyframes", "planned", "failed", "objects", "keypoints", "MiB")
+
+MapName = Annotated[str | None, typer.Option("--map", metavar="MAP", help="Only the recordings of this map.")]
+
+
+@settings_options(models=False)
+def command(
+    overrides: Overrides,
+    map_name: MapName = None,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="Look again every two seconds, until nothing is left to ingest.")
+    ] = False,
+    json: JsonFlag = False,
+) -> None:
+    """Show the recordings of the database: what is planned, stored and failed, and how much it is."""
+    from semdb.cli.output import print_json
+    from semdb.database.store import open_store
+
+    with open_store(overrides.settings().database_url) as store:
+        while True:
+            recordings, failed = look(store, map_name)
+            if json:
+                print_json([as_json(recording, failed) for recording in recordings])
+            else:
+                if watch and sys.stdout.isatty():
+                    typer.clear()
+                show(store, recordings, failed)
+            if not watch or all(recording.state == "complete" for recording in recordings):
+                return
+            time.sleep(SECONDS_BETWEEN_LOOKS)
+
+
+def look(store: Store, map_name: str | None) -> tuple[list[RecordingStatus], list[FailedItem]]:
+    """The recordings of a map, or of all, and their keyframes that failed. Raises `NotFoundError`."""
+    recordings = store.status(None if map_name is None else store.find_map(map_name).id)
+    known = {recording.recording_id for recording in recordings}
+    return recordings, [item for item in store.failed_items() if item.recording_id in known]
+
+
+def as_json(recording: RecordingStatus, failed: list[FailedItem]) -> dict[str, Any]:
+    """What `--json` prints for one recording."""
+    return {
+        "id": recording.recording_id,
+        "map": recording.map,
+        "recording": recording.name,
+        "format": recording.format,
+        "source": recording.source,
+        "state": str(recording.state),
+        "frames": recording.frame_count,
+        "items": dict(recording.items),
+        "keyframes": recording.keyframes,
+        "objects": recording.objects,
+        "keypoints": recording.keypoints,
+        "image_bytes": recording.image_bytes,
+        "failed": [
+            {"frame_index": item.frame_index, "attempts": item.attempts, "error": item.error}
+            for item in failed
+            if item.recording_id == recording.recording_id
+        ],
+    }
+
+
+def show(store: Store, recordings: list[RecordingStatus], failed: list[FailedItem]) -> None:
+    """Print the table for people, and the first errors."""
+    from semdb.cli.output import print_table
+
+    print(f"database: {store.url}")
+    if not recordings:
+        print("no recordings yet: semdb ingest PATH")
+        return
+    rows = [
+        (
+            r.recording_id,
+            r.map,
+            r.name,
+            r.format,
+            str(r.state),
+            r.keyframes,
+            sum(number for state, number in r.items.items() if state != "deleted"),
+            r.items.get("failed", 0),
+            r.objects,
+            r.keypoints,
+            round(r.image_bytes / 2**20, 1),
+        )
+        for r in recordings
+    ]
+    print_table(COLUMNS, rows)
+    names = {recording.recording_id: recording.name for recording in recordings}
+    for item in failed[:ERRORS_SHOWN]:
+        print(f"failed: {names[item.recording_id]} frame {item.frame_index}, attempt {item.attempts}: {item.error}")
+    if len(failed) > ERRORS_SHOWN:
+        print(f"and {len(failed) - ERRORS_SHOWN} more; --json lists all")
+
+
+@settings_options(models=False)
+def retry(overrides: Overrides, map_name: MapName = None) -> None:
+    """Put keyframes that failed back into the plan; the next `semdb ingest` of their recording tries them again."""
+    from semdb.database.requeue import requeue_failed
+    from semdb.database.store import open_store
+
+    with open_store(overrides.settings().database_url) as store:
+        recordings = store.status(None if map_name is None else store.find_map(map_name).id)
+        total = 0
+        for recording in recordings:
+            number = requeue_failed(store.engine, recording.recording_id)
+            total += number
+            if number:
+                print(f"{recording.map}/{recording.name}: {number} put back; run: semdb ingest {recording.source}")
+    if not total:
+        print("nothing has failed")

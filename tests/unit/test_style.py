@@ -1,0 +1,125 @@
+"""House rules that a machine can check."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from semdb.cli.main import COMMANDS, load_command
+from semdb.settings import Settings
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+LONGEST_FILE = 400
+CODE = ("semdb", "migrations", "workers", "bench", "scripts")
+# paths of one machine: home folders, and folders that no documentation needs to name
+MACHINE_PATH = re.compile(r"(?<![\w.])/(?:home|Users|root|work|mnt/[a-z]+)/[\w.-]+")
+REGISTRY_HOST = re.compile(r"pypi\.org|pythonhosted\.org|--index-url|--extra-index-url|--find-links|deb\.debian\.org")
+
+
+def tracked_files() -> list[Path]:
+    """The text files of the repository, those not yet committed among them."""
+    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
+    listed = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    if listed.returncode:
+        pytest.skip("not a git checkout")
+    files = [REPOSITORY / name for name in listed.stdout.splitlines()]
+    return [file for file in files if file.is_file() and b"\0" not in file.read_bytes()[:4096]]
+
+
+def commands() -> Iterator[tuple[str, Any]]:
+    """Every command with its full name, the commands of groups included."""
+    for name in COMMANDS:
+        command = load_command(name)
+        inner = getattr(command, "commands", None)
+        if inner is None:
+            yield name, command
+        else:
+            yield from ((f"{name} {inner_name}", inner_command) for inner_name, inner_command in inner.items())
+
+
+def test_files_are_short() -> None:
+    long_ones = []
+    for folder in CODE:
+        for file in (REPOSITORY / folder).rglob("*"):
+            if file.suffix in {".py", ".sh"}:
+                lines = len(file.read_text().splitlines())
+                if lines > LONGEST_FILE:
+                    long_ones.append(f"{file.relative_to(REPOSITORY)}: {lines} lines")
+    if long_ones:
+        warnings.warn(f"longer than {LONGEST_FILE} lines: {', '.join(long_ones)}", stacklevel=1)
+    assert not [name for name in long_ones if int(name.split(": ")[1].split()[0]) > 1.25 * LONGEST_FILE]
+
+
+@pytest.mark.parametrize("pattern", [MACHINE_PATH, REGISTRY_HOST], ids=["machine path", "registry host"])
+def test_files_name_no_machine_and_no_registry(pattern: re.Pattern[str]) -> None:
+    found = []
+    for file in tracked_files():
+        if file.name in {"LICENSE", Path(__file__).name}:
+            continue
+        for number, line in enumerate(file.read_text(errors="replace").splitlines(), 1):
+            if match := pattern.search(line):
+                found.append(f"{file.relative_to(REPOSITORY)}:{number}: {match[0]}")
+    assert not found, "\n".join(found)
+
+
+def test_the_patterns_find_what_they_should() -> None:
+    assert MACHINE_PATH.search("open('/home/ann/data.png')")
+    assert not MACHINE_PATH.search("see docs/work/notes.md and https://example.org/home/page")
+
+
+def test_the_lock_file_pins_every_dependency_and_nothing_else() -> None:
+    import tomllib
+
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    wanted = [*project["dependencies"], *extras["worker"], *extras["dev"]]
+    pinned = {}
+    for line in (REPOSITORY / "requirements" / "constraints.txt").read_text().splitlines():
+        if not line.startswith("#"):
+            match = re.fullmatch(r"([\w.-]+)==([\w.!+]+)", line)
+            assert match, f"not an exact version: {line}"
+            pinned[re.sub(r"[-_.]+", "-", match[1]).lower()] = match[2]
+
+    from packaging.requirements import Requirement
+
+    for text in wanted:
+        requirement = Requirement(text)
+        name = re.sub(r"[-_.]+", "-", requirement.name).lower()
+        assert name in pinned, f"{name} is not in the lock file: make lock"
+        assert requirement.specifier.contains(pinned[name]), f"{text} does not admit {pinned[name]}: make lock"
+    assert not {"torch", "torchvision", "semdb"} & set(pinned)
+
+
+def test_every_command_and_option_is_documented() -> None:
+    text = (REPOSITORY / "docs" / "commands.md").read_text()
+    sections = dict(re.findall(r"^#+ `semdb ([a-z ]+?)`.*?\n(.*?)(?=^#+ |\Z)", text, flags=re.M | re.S))
+    assert sorted(sections) == sorted(name for name, _ in commands())
+    missing = []
+    for name, command in commands():
+        assert command.help, f"semdb {name} has no help"
+        for parameter in command.params:
+            names = [option for option in parameter.opts if option.startswith("--") and option != "--help"]
+            if names and not any(f"{option}" in sections[name] for option in names):
+                missing.append(f"semdb {name} {names[0]}")
+    assert not missing, f"not in docs/commands.md: {missing}"
+
+
+def test_every_setting_is_documented_with_its_default() -> None:
+    text = (REPOSITORY / "docs" / "settings.md").read_text()
+    documented = set(re.findall(r"^\| `(SEMDB_[A-Z_]+)`", text, flags=re.M))
+    assert {f"SEMDB_{name.upper()}" for name in Settings.model_fields} <= documented
+    for name, field in Settings.model_fields.items():
+        (row,) = re.findall(rf"^\| `SEMDB_{name.upper()}` .*$", text, flags=re.M)
+        default = "none" if field.default is None else f"`{field.default}`"
+        assert default in row, f"docs/settings.md: SEMDB_{name.upper()} has the default {default}"
+
+
+def test_groups_are_typer_apps() -> None:
+    assert isinstance(__import__("semdb.cli.models", fromlist=["command"]).command, typer.Typer)
