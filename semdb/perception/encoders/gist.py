@@ -57,10 +57,9 @@ class GistEncoder:
         inner = response[:, margin:-margin, margin:-margin]
         cell = inner.shape[1] // GRID
         energies = inner.reshape(len(inner), GRID, cell, GRID, cell).mean(axis=(2, 4), dtype=np.float64)
-        # Without its mean over places and orientations every image looks like every other: more energy in coarse bands.
+        # Less its mean and scaled, each scale counts alike; as they are, coarse energy makes all images look alike.
         by_scale = energies.reshape(SCALES, -1)
-        centred: npt.NDArray[np.float64] = (by_scale - by_scale.mean(axis=1, keepdims=True)).ravel()
-        return centred
+        return np.concatenate([_unit(scale - scale.mean()) for scale in by_scale])
 
 
 def _even_contrast(grey: ImageArray) -> Float32Array:
