@@ -1,0 +1,244 @@
+"""Where the algorithms meet the database: a description in, a typed localization out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from semdb.database.planning import check_models
+from semdb.errors import NotFoundError
+from semdb.geometry import pose_error
+from semdb.localization.coarse import Batch, CoarseOptions, CoarseSource, Proposal, Stage, cascade
+from semdb.localization.keyframe_cache import KeyframeCache
+from semdb.localization.matching import Matches
+from semdb.localization.pose import PoseEstimate, PoseOptions, estimate_pose, match_view, rival_pose
+from semdb.localization.verdict import Judgement, VerdictOptions, convinces, judge
+from semdb.localization.views import KeyframeView, View, make_view
+from semdb.types import Candidate, Description, Float32Array, FloatArray, Localization, ModelInfo, Verdict
+
+
+@dataclass(frozen=True, slots=True)
+class LocalizerOptions:
+    """Everything that a method of `semdb evaluate` can vary."""
+
+    coarse: CoarseOptions = field(default_factory=CoarseOptions)
+    pose: PoseOptions = field(default_factory=PoseOptions)
+    verdict: VerdictOptions = field(default_factory=VerdictOptions)
+    neighbours: int = 1  # keyframes near the first pose that join once it convinces
+
+
+@dataclass(slots=True)
+class _Search:
+    """What one query has tried so far."""
+
+    query: View
+    keyframes: list[KeyframeView] = field(default_factory=list)
+    matches: list[Matches] = field(default_factory=list)
+    proposals: list[Proposal] = field(default_factory=list)
+    estimate: PoseEstimate | None = None
+    stage: str = Stage.FILTERED
+    ranked: int = 0
+    timing_ms: dict[str, float] = field(default_factory=lambda: {"filter": 0.0, "rank": 0.0, "match": 0.0, "pose": 0.0})
+
+
+class Localizer:
+    """Localizes descriptions in one map.
+
+    Not thread-safe: use one per thread. `source` answers the coarse step, `cache` loads keyframes.
+    """
+
+    def __init__(
+        self,
+        map_name: str,
+        models: Sequence[ModelInfo],
+        source: CoarseSource,
+        cache: KeyframeCache,
+        options: LocalizerOptions | None = None,
+    ) -> None:
+        self.map_name = map_name
+        self.models = tuple(models)
+        self.source = source
+        self.cache = cache
+        self.options = options or LocalizerOptions()
+
+    def localize(self, description: Description) -> Localization:
+        """The pose of `description` in the map.
+
+        Raises ProvenanceError when other models made the map, NotFoundError when the map holds no keyframe.
+        """
+        self._check(description)
+        search = _Search(self._view_of(description))
+        started = time.perf_counter()
+        batches = cascade(self.source, _class_counts(description), description.cnn_vector, self.options.coarse)
+        for batch in batches:
+            search.timing_ms["rank"] += _ms_since(started)
+            self._try(search, batch)
+            if convinces(search.estimate, self.options.verdict):
+                break
+            started = time.perf_counter()
+        return self._conclude(search)
+
+    def localize_among(self, description: Description, keyframe_ids: Sequence[int]) -> Localization:
+        """The fine step alone, on keyframes that the caller names (the `oracle` of evaluations)."""
+        self._check(description)
+        search = _Search(self._view_of(description))
+        proposals = tuple(Proposal(i, float("nan"), float("nan")) for i in keyframe_ids)
+        self._try(search, Batch(Stage.GIVEN, proposals, 0))
+        return self._conclude(search)
+
+    def _check(self, description: Description) -> None:
+        if self.source.refresh():
+            self.cache.forget()
+        if not self.source.keyframe_ids():
+            raise NotFoundError(f"map {self.map_name!r} holds no keyframe: ingest a recording into it first")
+        check_models(self.models, description.models, f"the map {self.map_name!r}")
+
+    def _view_of(self, description: Description) -> View:
+        categories = [detection.category for detection in description.detections]
+        return make_view(description.camera, description.keypoints, categories, self.cache.numbers)
+
+    def _try(self, search: _Search, batch: Batch) -> None:
+        search.stage, search.ranked = batch.stage, batch.ranked
+        search.proposals += batch.proposals
+        self._match(search, [proposal.keyframe_id for proposal in batch.proposals])
+        self._estimate(search)
+
+    def _match(self, search: _Search, keyframe_ids: Sequence[int]) -> None:
+        started = time.perf_counter()
+        for keyframe in self.cache.views(keyframe_ids):
+            search.keyframes.append(keyframe)
+            search.matches.append(match_view(search.query, keyframe, self.options.pose.matching))
+        search.timing_ms["match"] += _ms_since(started)
+
+    def _estimate(self, search: _Search) -> None:
+        started = time.perf_counter()
+        search.estimate = estimate_pose(search.query, search.keyframes, search.matches, self.options.pose)
+        search.timing_ms["pose"] += _ms_since(started)
+
+    def _conclude(self, search: _Search) -> Localization:
+        if convinces(search.estimate, self.options.verdict) and search.stage != Stage.GIVEN:
+            self._ask_neighbours(search)
+        started = time.perf_counter()
+        rival = 0
+        if search.estimate is not None:
+            rival = rival_pose(search.query, search.keyframes, search.matches, search.estimate, self.options.pose)
+        judgement = judge(search.estimate, rival, self.options.verdict)
+        search.timing_ms["pose"] += _ms_since(started)
+        return self._result(search, judgement)
+
+    def _ask_neighbours(self, search: _Search) -> None:
+        """Keyframes near the first pose see the same things from elsewhere: their pairs steady the pose."""
+        if search.estimate is None or self.options.neighbours == 0:
+            return
+        matched = {keyframe.keyframe_id for keyframe in search.keyframes}
+        ids, poses = self.cache.poses()
+        distance = [
+            np.inf if i in matched else _pose_distance(search.estimate.world_from_camera, pose)
+            for i, pose in zip(ids, poses, strict=True)
+        ]
+        nearest = [int(n) for n in np.argsort(distance, kind="stable")[: self.options.neighbours]]
+        chosen = [ids[n] for n in nearest if distance[n] < 4.0]
+        if not chosen:
+            return
+        before = search.estimate
+        search.proposals += [Proposal(i, float("nan"), float("nan")) for i in chosen]
+        self._match(search, chosen)
+        self._estimate(search)
+        if search.estimate is None or search.estimate.inliers < before.inliers:
+            search.estimate = before
+
+    def _result(self, search: _Search, judgement: Judgement) -> Localization:
+        estimate = search.estimate if judgement.verdict is not Verdict.FAILED else None
+        inliers = dict.fromkeys((keyframe.keyframe_id for keyframe in search.keyframes), 0)
+        if estimate is not None:
+            ids = [keyframe.keyframe_id for keyframe in search.keyframes]
+            inliers.update(zip(ids, estimate.per_keyframe, strict=False))
+        best = max(inliers, key=lambda i: inliers[i]) if estimate is not None else None
+        query_xy, keyframe_xy = _best_pairs(search, estimate, best)
+        return Localization(
+            verdict=judgement.verdict,
+            map_name=self.map_name,
+            world_from_camera=None if estimate is None else estimate.world_from_camera,
+            covariance=None if estimate is None else estimate.covariance,
+            confidence=judgement.confidence,
+            inliers=0 if search.estimate is None else search.estimate.inliers,
+            stage=search.stage,
+            candidates=self._candidates(search, inliers),
+            ranked_share=search.ranked / max(len(self.source.keyframe_ids()), 1),
+            keyframes_matched=len(search.keyframes),
+            reason=judgement.reason,
+            timing_ms=search.timing_ms,
+            best_keyframe_id=best,
+            query_xy=query_xy,
+            keyframe_xy=keyframe_xy,
+        )
+
+    def _candidates(self, search: _Search, inliers: dict[int, int]) -> tuple[Candidate, ...]:
+        return tuple(
+            Candidate(
+                keyframe_id=proposal.keyframe_id,
+                recording=self.cache.name_of(proposal.keyframe_id)[0],
+                frame_index=self.cache.name_of(proposal.keyframe_id)[1],
+                class_score=proposal.class_score,
+                cosine=proposal.cosine,
+                inliers=inliers.get(proposal.keyframe_id, 0),
+            )
+            for proposal in search.proposals
+        )
+
+
+class _TimedSource:
+    """A source that adds up how long its class filter takes."""
+
+    def __init__(self, source: CoarseSource) -> None:
+        self._source = source
+        self.filter_ms = 0.0
+
+    def refresh(self) -> bool:
+        return self._source.refresh()
+
+    def keyframe_ids(self) -> Sequence[int]:
+        return self._source.keyframe_ids()
+
+    def class_scores(self, counts: Mapping[str, float]) -> dict[int, float]:
+        started = time.perf_counter()
+        scores = self._source.class_scores(counts)
+        self.filter_ms += _ms_since(started)
+        return scores
+
+    def filtered(self, counts: Mapping[str, float], minimum_share: float) -> dict[int, float]:
+        started = time.perf_counter()
+        scores = self._source.filtered(counts, minimum_share)
+        self.filter_ms += _ms_since(started)
+        return scores
+
+    def vectors(self, keyframe_ids: Sequence[int]) -> Float32Array:
+        return self._source.vectors(keyframe_ids)
+
+
+def _class_counts(description: Description) -> dict[str, float]:
+    return {name: float(count) for name, count in description.category_counts.items()}
+
+
+def _pose_distance(first: FloatArray, second: FloatArray) -> float:
+    """Unitless: 0.3 m and 15 degrees count alike."""
+    distance, angle = pose_error(first, second)
+    return distance / 0.3 + angle / 15
+
+
+def _best_pairs(
+    search: _Search, estimate: PoseEstimate | None, best: int | None
+) -> tuple[Float32Array | None, Float32Array | None]:
+    """Pixels as seen of the inlier pairs with the best keyframe, for pictures."""
+    if estimate is None or best is None:
+        return None, None
+    slot = next(s for s, keyframe in enumerate(search.keyframes) if keyframe.keyframe_id == best)
+    pairs = estimate.pairs.take(estimate.pairs.slot == slot)
+    return search.query.seen_xy[pairs.query], search.keyframes[slot].view.seen_xy[pairs.keypoint]
+
+
+def _ms_since(started: float) -> float:
+    return (time.perf_counter() - started) * 1000

@@ -1,0 +1,281 @@
+"""The fine step: 2D-3D pairs from several keyframes, robust PnP, guided matching, bundle adjustment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import poselib
+
+from semdb.geometry import invert_pose, pose_error
+from semdb.localization.bundle import BundleProblem, BundleResult, adjust, pixel_sigma
+from semdb.localization.matching import Matches, MatchingOptions, match_guided, match_keypoints
+from semdb.localization.views import KeyframeView, View
+from semdb.types import BoolArray, FloatArray, IntArray
+
+MINIMUM_PAIRS = 6  # below, a pose from 3 points has nothing to be checked with
+
+
+@dataclass(frozen=True, slots=True)
+class PoseOptions:
+    """Pixels are of the query image."""
+
+    matching: MatchingOptions = field(default_factory=MatchingOptions)
+    max_reprojection_px: float = 6.0
+    inlier_px: float = 4.0
+    pixel_sigma_px: float = 1.0
+    guided: bool = True
+    bundle: bool = True
+    use_query_depth: bool = True
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pairs:
+    """2D-3D pairs of a query with several keyframes (`slot` counts them)."""
+
+    query: IntArray  # [n] keypoint of the query
+    slot: IntArray  # [n] which keyframe
+    keypoint: IntArray  # [n] keypoint of that keyframe
+    same_class: BoolArray  # [n]
+
+    def __len__(self) -> int:
+        return len(self.query)
+
+    def take(self, keep: BoolArray | IntArray) -> Pairs:
+        return Pairs(self.query[keep], self.slot[keep], self.keypoint[keep], self.same_class[keep])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseEstimate:
+    """A pose with its support. `inliers` counts distinct keypoints of the query, `per_keyframe` the pairs."""
+
+    world_from_camera: FloatArray
+    covariance: FloatArray | None
+    pairs: Pairs  # inliers only
+    inliers: int
+    per_keyframe: tuple[int, ...]
+    tried_pairs: int
+    residual_px: float  # median reprojection error of the inliers
+    spread: float  # 0..1: share of a 4x4 grid over the image that holds inliers
+
+
+def join_pairs(matches: Sequence[Matches]) -> Pairs:
+    """Pairs of one query with several keyframes, in the order of `matches`."""
+    if not matches:
+        empty = np.zeros(0, np.int32)
+        return Pairs(empty, empty, empty, np.zeros(0, np.bool_))
+    return Pairs(
+        np.concatenate([m.query for m in matches]),
+        np.concatenate([np.full(len(m), slot, np.int32) for slot, m in enumerate(matches)]),
+        np.concatenate([m.keyframe for m in matches]),
+        np.concatenate([m.same_class for m in matches]),
+    )
+
+
+def match_view(query: View, keyframe: KeyframeView, options: MatchingOptions) -> Matches:
+    """First matching, without a pose."""
+    view = keyframe.view
+    return match_keypoints(query.descriptors, view.descriptors, query.classes, view.classes, options)
+
+
+def world_points_of(pairs: Pairs, keyframes: Sequence[KeyframeView]) -> FloatArray:
+    """The stored 3D point ``[n, 3]`` of each pair, in the world."""
+    points = np.empty((len(pairs), 3))
+    for slot, keyframe in enumerate(keyframes):
+        rows = pairs.slot == slot
+        points[rows] = keyframe.world_points[pairs.keypoint[rows]]
+    return points
+
+
+def reprojection_px(query: View, camera_from_world: FloatArray, rows: IntArray, points: FloatArray) -> FloatArray:
+    """Distance ``[n]`` in (undistorted) pixels of the query between keypoints `rows` and world `points`."""
+    moved = points @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        offset = moved[:, :2] / moved[:, 2:] - query.xy[rows]
+    distance = np.hypot(offset[:, 0], offset[:, 1]) * query.focal
+    return np.where(moved[:, 2] > 0.05, distance, np.inf)
+
+
+def robust_pnp(
+    query: View, pairs: Pairs, points: FloatArray, options: PoseOptions
+) -> tuple[FloatArray, BoolArray] | None:
+    """LO-RANSAC over all pairs (PoseLib): ``camera_from_world`` and which pairs agree; None where none is found."""
+    if len(pairs) < MINIMUM_PAIRS:
+        return None
+    focal = query.focal
+    pixels = query.xy[pairs.query] * focal
+    camera = {
+        "model": "SIMPLE_PINHOLE",
+        "width": query.camera.width,
+        "height": query.camera.height,
+        "params": [focal, 0, 0],
+    }
+    ransac = {
+        "max_reproj_error": options.max_reprojection_px,
+        "min_iterations": 200,
+        "max_iterations": 10000,
+        "seed": 0,
+    }
+    pose, report = poselib.estimate_absolute_pose(pixels, points, camera, ransac, {"loss_type": "CAUCHY"})
+    inliers = np.asarray(report["inliers"], np.bool_)
+    if inliers.sum() < MINIMUM_PAIRS:
+        return None
+    camera_from_world = np.eye(4)
+    camera_from_world[:3] = pose.Rt
+    if not np.isfinite(camera_from_world).all():
+        return None
+    return camera_from_world, inliers
+
+
+def guided_pairs(
+    query: View, keyframes: Sequence[KeyframeView], camera_from_world: FloatArray, options: PoseOptions
+) -> Pairs:
+    """Second matching: only near the projections of the keyframes' points under the first pose."""
+    focal = query.focal
+    matches = []
+    for keyframe in keyframes:
+        moved = keyframe.world_points @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            projected = np.where(moved[:, 2:] > 0.05, moved[:, :2] / moved[:, 2:], np.nan) * focal
+        view = keyframe.view
+        matches.append(
+            match_guided(
+                query.descriptors,
+                view.descriptors,
+                query.xy * focal,
+                projected,
+                query.classes,
+                view.classes,
+                options.matching,
+            )
+        )
+    return join_pairs(matches)
+
+
+def estimate_pose(
+    query: View, keyframes: Sequence[KeyframeView], matches: Sequence[Matches], options: PoseOptions
+) -> PoseEstimate | None:
+    """The pose that the pairs with all `keyframes` agree on, or None.
+
+    `matches` are those of `match_view`, one per keyframe.
+    """
+    pairs = join_pairs(matches)
+    tried = len(pairs)
+    points = world_points_of(pairs, keyframes)
+    found = robust_pnp(query, pairs, points, options)
+    if found is None:
+        return None
+    camera_from_world, agreeing = found
+    if options.guided:
+        pairs = guided_pairs(query, keyframes, camera_from_world, options)
+        points = world_points_of(pairs, keyframes)
+        agreeing = reprojection_px(query, camera_from_world, pairs.query, points) < options.max_reprojection_px
+        if agreeing.sum() < MINIMUM_PAIRS:
+            return None
+    pairs, points = pairs.take(agreeing), points[agreeing]
+    covariance = None
+    if options.bundle:
+        try:
+            refined = bundle_adjust(query, keyframes, pairs, points, camera_from_world, options)
+        except np.linalg.LinAlgError:
+            return None
+        camera_from_world, covariance = refined.camera_from_world, refined.covariance
+    return _estimate(query, keyframes, pairs, points, camera_from_world, covariance, tried, options)
+
+
+def rival_pose(
+    query: View,
+    keyframes: Sequence[KeyframeView],
+    matches: Sequence[Matches],
+    best: PoseEstimate,
+    options: PoseOptions,
+) -> int:
+    """Inliers (distinct query keypoints) of the best pose elsewhere, among the pairs that `best` leaves over.
+
+    Elsewhere is more than 0.5 m or 15 degrees away; 0 when there is none.
+    """
+    pairs = join_pairs(matches[: len(best.per_keyframe)])
+    points = world_points_of(pairs, keyframes)
+    camera_from_world = invert_pose(best.world_from_camera)
+    left = reprojection_px(query, camera_from_world, pairs.query, points) >= 2 * options.max_reprojection_px
+    found = robust_pnp(query, pairs.take(left), points[left], options)
+    if found is None:
+        return 0
+    rival, agreeing = found
+    distance, angle = pose_error(invert_pose(rival), best.world_from_camera)
+    if distance < 0.5 and angle < 15:
+        return 0
+    return len(np.unique(pairs.take(left).query[agreeing]))
+
+
+def _estimate(
+    query: View,
+    keyframes: Sequence[KeyframeView],
+    pairs: Pairs,
+    points: FloatArray,
+    camera_from_world: FloatArray,
+    covariance: FloatArray | None,
+    tried: int,
+    options: PoseOptions,
+) -> PoseEstimate | None:
+    error = reprojection_px(query, camera_from_world, pairs.query, points)
+    keep = error < options.inlier_px
+    if keep.sum() < MINIMUM_PAIRS or not np.isfinite(camera_from_world).all():
+        return None
+    inliers = pairs.take(keep)
+    return PoseEstimate(
+        world_from_camera=invert_pose(camera_from_world),
+        covariance=covariance,
+        pairs=inliers,
+        inliers=len(np.unique(inliers.query)),
+        per_keyframe=tuple(int((inliers.slot == slot).sum()) for slot in range(len(keyframes))),
+        tried_pairs=tried,
+        residual_px=float(np.median(error[keep])),
+        spread=image_spread(query, inliers.query),
+    )
+
+
+def image_spread(query: View, rows: IntArray) -> float:
+    """Share of the cells of a 4x4 grid over the query image that hold at least one of the keypoints `rows`."""
+    size = np.array([query.camera.width, query.camera.height])
+    cells = np.clip((query.seen_xy[rows] * 4 / size).astype(int), 0, 3)
+    return len(np.unique(cells[:, 0] * 4 + cells[:, 1])) / 16
+
+
+def bundle_adjust(
+    query: View,
+    keyframes: Sequence[KeyframeView],
+    pairs: Pairs,
+    points: FloatArray,
+    camera_from_world: FloatArray,
+    options: PoseOptions,
+) -> BundleResult:
+    """Equation (5) over the agreeing pairs. Pairs of one query keypoint with several keyframes are one point."""
+    rows, point_index = np.unique(pairs.query, return_inverse=True)
+    counts = np.bincount(point_index).astype(np.float64)
+    first_guess = np.stack([np.bincount(point_index, points[:, axis]) / counts for axis in range(3)], axis=1)
+    xy = np.empty((len(pairs), 2))
+    sigma, depth = np.empty(len(pairs)), np.empty(len(pairs))
+    rotation, translation = np.empty((len(pairs), 3, 3)), np.empty((len(pairs), 3))
+    for slot, keyframe in enumerate(keyframes):
+        here = pairs.slot == slot
+        chosen = pairs.keypoint[here]
+        xy[here] = keyframe.view.xy[chosen]
+        sigma[here] = pixel_sigma(keyframe.view.size[chosen], keyframe.view.focal, options.pixel_sigma_px)
+        depth[here] = keyframe.view.points[chosen, 2]
+        rotation[here], translation[here] = keyframe.camera_from_world[:3, :3], keyframe.camera_from_world[:3, 3]
+    query_depth = query.points[rows, 2].astype(np.float64)
+    problem = BundleProblem(
+        points=first_guess,
+        query_xy=query.xy[rows],
+        query_sigma=pixel_sigma(query.size[rows], query.focal, options.pixel_sigma_px),
+        query_depth=query_depth if options.use_query_depth else np.full(len(rows), np.nan),
+        keyframe_point=point_index.astype(np.int32),
+        keyframe_xy=xy,
+        keyframe_sigma=sigma,
+        keyframe_depth=depth,
+        keyframe_rotation=rotation,
+        keyframe_translation=translation,
+    )
+    return adjust(problem, camera_from_world)

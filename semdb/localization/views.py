@@ -1,0 +1,106 @@
+"""What the fine step needs of a query and of a keyframe: arrays, with what can be computed once computed once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from semdb.geometry import invert_pose, pixels_to_normalized, transform_points
+from semdb.localization.matching import BACKGROUND
+from semdb.types import Camera, Float32Array, FloatArray, IntArray, Keypoints
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """Keypoints of one image. `xy` are normalised undistorted coordinates, `classes` numbers shared by all views.
+
+    Keypoints that a strongly distorted lens leaves without a ray are gone; `source` ``[n]`` are the indexes in
+    the `Keypoints` that the rest came from.
+    """
+
+    camera: Camera
+    seen_xy: Float32Array  # [n, 2] pixels, as seen
+    xy: FloatArray  # [n, 2]
+    size: Float32Array  # [n] pixels
+    descriptors: npt.NDArray[np.generic]  # [n, d]
+    classes: IntArray  # [n], -1 in the background
+    points: Float32Array  # [n, 3] camera frame, NaN where there is no depth
+    source: IntArray  # [n]
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+    @property
+    def focal(self) -> float:
+        return (self.camera.fx + self.camera.fy) / 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframeView:
+    """A view with a pose; only keypoints that have a 3D point."""
+
+    keyframe_id: int
+    view: View
+    world_from_camera: FloatArray
+    camera_from_world: FloatArray
+    world_points: FloatArray  # [n, 3]
+
+
+class ClassNumbers:
+    """Numbers class names in the order in which they are first asked for."""
+
+    def __init__(self) -> None:
+        self._numbers: dict[str, int] = {}
+
+    def of(self, name: str) -> int:
+        return self._numbers.setdefault(name, len(self._numbers))
+
+
+def make_view(
+    camera: Camera,
+    keypoints: Keypoints,
+    object_categories: Sequence[str],
+    numbers: ClassNumbers,
+    *,
+    with_points_only: bool = False,
+) -> View:
+    """The view of `keypoints`, whose object ``i`` is of class ``object_categories[i]``."""
+    features = keypoints.features
+    table = np.array([*(numbers.of(name) for name in object_categories), BACKGROUND], np.int32)
+    xy = pixels_to_normalized(camera, features.xy)
+    usable = np.isfinite(xy).all(axis=1)
+    if with_points_only:
+        usable &= np.isfinite(keypoints.points).all(axis=1)
+    keep = np.flatnonzero(usable)
+    return View(
+        camera=camera,
+        seen_xy=features.xy[keep],
+        xy=xy[keep],
+        size=features.size[keep],
+        descriptors=features.descriptors[keep],
+        classes=table[keypoints.object_index[keep]],  # -1 takes the last entry: the background
+        points=keypoints.points[keep],
+        source=keep.astype(np.int32),
+    )
+
+
+def make_keyframe_view(
+    keyframe_id: int,
+    camera: Camera,
+    world_from_camera: FloatArray,
+    keypoints: Keypoints,
+    object_categories: Sequence[str],
+    numbers: ClassNumbers,
+) -> KeyframeView:
+    """The view of a stored keyframe, with its points moved to the world."""
+    view = make_view(camera, keypoints, object_categories, numbers, with_points_only=True)
+    return KeyframeView(
+        keyframe_id=keyframe_id,
+        view=view,
+        world_from_camera=world_from_camera,
+        camera_from_world=invert_pose(world_from_camera),
+        world_points=transform_points(world_from_camera, view.points),
+    )

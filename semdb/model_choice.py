@@ -1,0 +1,85 @@
+"""Which detector, encoder and feature to use where the settings say ``auto``, and what to tell people about it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from semdb.errors import UsageError
+from semdb.settings import Settings
+from semdb.types import ModelInfo
+
+AUTO = "auto"
+ROLES = ("detector", "encoder", "features")
+
+
+@dataclass(frozen=True, slots=True)
+class ModelSpecs:
+    """Concrete specs, and a line for people about each that nobody asked for by name."""
+
+    detector: str
+    encoder: str
+    features: str
+    notes: tuple[str, ...] = ()
+
+
+def specs_for_ingest(settings: Settings, map_models: Sequence[ModelInfo], *, has_masks: bool) -> ModelSpecs:
+    """What describes a recording: the settings, else what the map was described by, else what needs no file.
+
+    `has_masks` tells whether the recording brings object masks. Raises UsageError when no detector is at hand.
+    """
+    known = {model.role: model for model in map_models}
+    chosen: dict[str, str] = {}
+    notes: list[str] = []
+    fallback = {"detector": "recorded" if has_masks else "", "encoder": "gist", "features": "surf"}
+    reason = {
+        "detector": "SEMDB_DETECTOR is not set: the masks that come with the recording are the detections",
+        "encoder": "SEMDB_ENCODER is not set: places are described by gist, which needs no model file",
+        "features": "",
+    }
+    for role in ROLES:
+        spec = str(getattr(settings, role))
+        if spec == AUTO and role in known:
+            spec = _spec_of(known[role], settings)
+        elif spec == AUTO:
+            spec = fallback[role]
+            notes += [reason[role]] if reason[role] and spec else []
+        chosen[role] = spec
+    if not chosen["detector"]:
+        raise UsageError(
+            "this recording brings no object masks, so a detector is needed: set SEMDB_DETECTOR=onnx:FILE "
+            "(a Mask R-CNN as ONNX, see docs/models.md) or pass --detector"
+        )
+    return ModelSpecs(**chosen, notes=tuple(notes))
+
+
+def specs_for_query(settings: Settings, map_models: Sequence[ModelInfo]) -> ModelSpecs:
+    """What describes a query: the settings, else what the map was described by.
+
+    Raises UsageError when the file of a map's model is not at hand.
+    """
+    known = {model.role: model for model in map_models}
+    chosen = {}
+    for role in ROLES:
+        spec = str(getattr(settings, role))
+        chosen[role] = _spec_of(known[role], settings) if spec == AUTO and role in known else spec
+    if AUTO in chosen.values():
+        raise UsageError(
+            "the map holds no keyframe yet, so it cannot say which models to use: ingest a recording first"
+        )
+    return ModelSpecs(**chosen)
+
+
+def _spec_of(model: ModelInfo, settings: Settings) -> str:
+    """The spec that loads `model` here; files of ``onnx:`` models are looked for in the cache directory."""
+    scheme, _, file_name = model.name.partition(":")
+    if not file_name or scheme != "onnx":
+        return model.name
+    path: Path = settings.cache_dir.expanduser() / "models" / file_name
+    if path.is_file():
+        return f"onnx:{path}"
+    raise UsageError(
+        f"the map was described by {model.role} {model.name} (sha256 {model.sha256[:12]}...): set "
+        f"SEMDB_{model.role.upper()}=onnx:PATH to that file, or put it at {path}"
+    )

@@ -1,0 +1,197 @@
+"""Robust PnP, guided matching, bundle adjustment: poses against the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from semdb.geometry import invert_pose, pose_error, so3_exp
+from semdb.localization.bundle import BundleProblem, _linearise, _move, adjust, depth_sigma
+from semdb.localization.matching import Evidence, MatchingOptions
+from semdb.localization.pose import PoseOptions, estimate_pose, match_view, rival_pose
+from semdb.localization.views import ClassNumbers, make_keyframe_view
+from tests.unit.localization_scene import CAMERA, DISTORTED, Scene
+
+NO_DEPTH = PoseOptions(use_query_depth=False)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 1000), metres=st.floats(0, 0.5), degrees=st.floats(0, 20))
+def test_exact_views_give_the_exact_pose(seed: int, metres: float, degrees: float) -> None:
+    scene, numbers = Scene(seed), ClassNumbers()
+    keyframe = scene.keyframe(1, np.eye(4), numbers)
+    truth = scene.pose(metres, degrees)
+    query = scene.query(truth, numbers)
+    matches = [match_view(query, keyframe, NO_DEPTH.matching)]
+    estimate = estimate_pose(query, [keyframe], matches, NO_DEPTH)
+    assert estimate is not None
+    distance, angle = pose_error(estimate.world_from_camera, truth)
+    assert distance < 1e-4
+    assert angle < 1e-3
+    assert estimate.inliers >= 60
+
+
+def test_distortion_is_in_the_keypoints() -> None:
+    scene, numbers = Scene(3), ClassNumbers()
+    keyframe = scene.keyframe(1, np.eye(4), numbers, DISTORTED)
+    truth = scene.pose(0.3, 10)
+    query = scene.query(truth, numbers, DISTORTED)
+    estimate = estimate_pose(query, [keyframe], [match_view(query, keyframe, NO_DEPTH.matching)], NO_DEPTH)
+    assert estimate is not None
+    distance, angle = pose_error(estimate.world_from_camera, truth)
+    assert distance < 1e-4
+    assert angle < 1e-3
+
+
+def test_bundle_adjustment_beats_pnp_when_depth_is_noisy() -> None:
+    errors: dict[bool, list[float]] = {True: [], False: []}
+    for seed in range(12):
+        scene, numbers = Scene(seed, count=200), ClassNumbers()
+        keyframes = [
+            scene.keyframe(i, scene.pose(0.3, 8), numbers, pixel_noise=0.5, depth_noise=0.01) for i in range(3)
+        ]
+        truth = scene.pose(0.3, 10)
+        query = scene.query(truth, numbers, pixel_noise=0.5)
+        for bundle in (True, False):
+            options = PoseOptions(bundle=bundle, use_query_depth=False)
+            matches = [match_view(query, keyframe, options.matching) for keyframe in keyframes]
+            estimate = estimate_pose(query, keyframes, matches, options)
+            assert estimate is not None
+            errors[bundle].append(pose_error(estimate.world_from_camera, truth)[0])
+    assert np.median(errors[True]) < 0.005
+    assert np.mean(errors[True]) < np.mean(errors[False])
+
+
+def test_query_depth_improves_the_position() -> None:
+    errors: dict[bool, list[float]] = {True: [], False: []}
+    for seed in range(12):
+        scene, numbers = Scene(seed, count=60), ClassNumbers()
+        keyframe = scene.keyframe(1, np.eye(4), numbers, pixel_noise=1.0)
+        truth = scene.pose(0.3, 10)
+        query = scene.query(truth, numbers, pixel_noise=1.0)
+        for use_depth in (True, False):
+            options = PoseOptions(use_query_depth=use_depth)
+            estimate = estimate_pose(query, [keyframe], [match_view(query, keyframe, options.matching)], options)
+            assert estimate is not None
+            errors[use_depth].append(pose_error(estimate.world_from_camera, truth)[0])
+    assert np.mean(errors[True]) < 0.9 * np.mean(errors[False])
+
+
+def test_covariance_is_honest() -> None:
+    """Normalised estimation errors squared of 6 degrees of freedom have a mean of 6."""
+    squared = []
+    for seed in range(60):
+        scene, numbers = Scene(seed, count=150), ClassNumbers()
+        keyframe = scene.keyframe(1, np.eye(4), numbers, pixel_noise=1.0)
+        truth = scene.pose(0.3, 10)
+        query = scene.query(truth, numbers, pixel_noise=1.0)
+        options = PoseOptions(use_query_depth=False, inlier_px=12, max_reprojection_px=12)
+        estimate = estimate_pose(query, [keyframe], [match_view(query, keyframe, options.matching)], options)
+        assert estimate is not None
+        assert estimate.covariance is not None
+        turn = estimate.world_from_camera[:3, :3] @ truth[:3, :3].T
+        vector = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
+        error = np.concatenate([estimate.world_from_camera[:3, 3] - truth[:3, 3], vector])
+        squared.append(error @ np.linalg.solve(estimate.covariance, error))
+    assert 4.0 < np.mean(squared) < 9.0
+
+
+def test_wrong_pairs_are_outvoted_and_a_rival_place_is_seen() -> None:
+    scene, numbers = Scene(5, count=300), ClassNumbers()
+    keyframe = scene.keyframe(1, np.eye(4), numbers)
+    elsewhere = np.eye(4)
+    elsewhere[0, 3] = 50.0  # the same look again, fifty metres away
+    keypoints = scene.keypoints(np.eye(4))
+    twin = make_keyframe_view(2, CAMERA, elsewhere, keypoints, scene.categories, numbers)
+    truth = scene.pose(0.2, 5)
+    query = scene.query(truth, numbers)
+    matches = [match_view(query, k, NO_DEPTH.matching) for k in (keyframe, twin)]
+    estimate = estimate_pose(query, [keyframe, twin], matches, NO_DEPTH)
+    assert estimate is not None
+    rival = rival_pose(query, [keyframe, twin], matches, estimate, NO_DEPTH)
+    assert rival > 0.8 * estimate.inliers
+    alone = estimate_pose(query, [keyframe], matches[:1], NO_DEPTH)
+    assert alone is not None
+    assert rival_pose(query, [keyframe], matches[:1], alone, NO_DEPTH) == 0
+
+
+def test_nothing_in_common_gives_no_pose() -> None:
+    numbers = ClassNumbers()
+    keyframe = Scene(1).keyframe(1, np.eye(4), numbers)
+    query = Scene(2).query(np.eye(4), numbers)
+    estimate = estimate_pose(query, [keyframe], [match_view(query, keyframe, NO_DEPTH.matching)], NO_DEPTH)
+    assert estimate is None or estimate.inliers < 14
+
+
+def test_objects_only_uses_no_background() -> None:
+    scene, numbers = Scene(7), ClassNumbers()
+    keyframe = scene.keyframe(1, np.eye(4), numbers)
+    query = scene.query(scene.pose(0.1, 5), numbers)
+    options = PoseOptions(matching=MatchingOptions(evidence=Evidence.OBJECTS), use_query_depth=False)
+    estimate = estimate_pose(query, [keyframe], [match_view(query, keyframe, options.matching)], options)
+    assert estimate is not None
+    assert (query.classes[estimate.pairs.query] >= 0).all()
+    assert estimate.pairs.same_class.all()
+
+
+def _random_problem(seed: int) -> tuple[BundleProblem, np.ndarray]:
+    random = np.random.default_rng(seed)
+    points = random.uniform([-1, -1, 2], [1, 1, 4], (8, 3))
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = so3_exp(random.normal(size=3) * 0.1), random.normal(size=3) * 0.1
+    index = np.array([0, 1, 2, 3, 4, 5, 6, 7, 0, 3], np.int32)
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    problem = BundleProblem(
+        points=points + random.normal(size=points.shape) * 0.01,
+        query_xy=local[:, :2] / local[:, 2:] + random.normal(size=(8, 2)) * 0.001,
+        query_sigma=np.full(8, 1 / 500),
+        query_depth=np.where(np.arange(8) % 2 == 0, local[:, 2], np.nan),
+        keyframe_point=index,
+        keyframe_xy=points[index, :2] / points[index, 2:],
+        keyframe_sigma=np.full(10, 1 / 500),
+        keyframe_depth=points[index, 2],
+        keyframe_rotation=np.broadcast_to(np.eye(3), (10, 3, 3)).copy(),
+        keyframe_translation=np.zeros((10, 3)),
+    )
+    return problem, pose
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_gradient_is_that_of_the_cost(seed: int) -> None:
+    """Analytic gradient against central differences of the robust cost (the loss halves near the minimum)."""
+    problem, pose = _random_problem(seed)
+    blocks = _linearise(problem, pose, problem.points)
+    step = 1e-6
+    for axis in range(6):
+        move = np.zeros(6)
+        move[axis] = step
+        ahead = _linearise(problem, _move(pose, move), problem.points).cost
+        behind = _linearise(problem, _move(pose, -move), problem.points).cost
+        assert (ahead - behind) / (4 * step) == pytest.approx(blocks.pose_gradient[axis], rel=1e-3, abs=0.5)
+    moved = problem.points.copy()
+    moved[3, 2] += step
+    ahead = _linearise(problem, pose, moved).cost
+    moved[3, 2] -= 2 * step
+    behind = _linearise(problem, pose, moved).cost
+    assert (ahead - behind) / (4 * step) == pytest.approx(blocks.points_gradient[3, 2], rel=1e-3, abs=0.5)
+
+
+def test_adjustment_lowers_the_cost_and_reports_its_residuals() -> None:
+    problem, pose = _random_problem(1)
+    start = _linearise(problem, pose, problem.points).cost
+    result = adjust(problem, pose)
+    assert _linearise(problem, result.camera_from_world, result.points).cost < 0.5 * start
+    assert result.query_chi2.shape == (8,)
+    assert np.linalg.eigvalsh(result.covariance)[0] > 0
+    assert np.allclose(invert_pose(invert_pose(result.camera_from_world)), result.camera_from_world)
+
+
+def test_depth_noise_grows_with_the_square_of_depth() -> None:
+    assert depth_sigma(np.array([0.4]))[0] == pytest.approx(0.0012)
+    assert depth_sigma(np.array([2.4]))[0] == pytest.approx(0.0012 + 0.0019 * 4)
+
+
+def test_camera_of_the_scene_sees_it() -> None:
+    assert len(Scene(0).keypoints(np.eye(4), CAMERA)) > 200
