@@ -47,8 +47,8 @@ def list_models(overrides: Overrides, json: JsonFlag = False) -> None:
         return
     print_table(("role", "spec", "description"), [(role, spec, text) for role, spec, _, text in SPECS])
     print("\nset: " + ", ".join(f"{role} {spec}" for role, spec in chosen.items()))
-    if used is None:
-        print("maps: no database yet")
+    if not used:
+        print("maps: " + ("no database yet" if used is None else "none yet"))
         return
     print()
     columns = ("map", "role", "name", "sha256", "config")

@@ -6,7 +6,7 @@ import functools
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
@@ -100,15 +100,16 @@ def settings_options(*, models: bool) -> Callable[[Callable[..., None]], Callabl
             for name, annotation in options.items()
         ]
 
-        @functools.wraps(function)
-        def command(**arguments: Any) -> None:
+        def call(**arguments: Any) -> None:
             overrides = Overrides(**{name: arguments.pop(name) for name in options})
             function(**arguments, overrides=overrides)
 
+        # typer reads a command's options from its signature
         new = signature.replace(parameters=[p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in kept] + added)
+        command: Any = functools.wraps(function)(call)
+        del command.__wrapped__
         command.__signature__ = new
         command.__annotations__ = {p.name: p.annotation for p in new.parameters.values()} | {"return": None}
-        del command.__wrapped__
-        return command
+        return cast(Callable[..., None], command)
 
     return decorate

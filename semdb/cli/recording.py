@@ -105,19 +105,18 @@ def as_text(recording: Recording, quick: bool) -> str:
     triples = f"{number['triples']} with colour, depth and pose"
     if number["triples"] != number["usable"]:
         triples += f"; {number['with_depth']} with depth, {number['with_pose']} with a pose"
+    registered = f", registered to colour ({recording.depth_registration})" if recording.depth_registration else ""
     rows = [
         ("recording", f"{recording.name} ({recording.format}) in {recording.path}"),
         ("frames", f"{number['frames']}, usable {number['usable']} ({triples})"),
         ("dropped", f"{len(dropped)}{' (images were not decoded: --quick)' if quick else ''}"),
         *(("", line) for line in group_dropped(dropped)),
         ("camera", describe_camera(recording.camera)),
-        ("depth scale", f"{recording.depth_scale:g} per metre"),
+        ("depth scale", f"{recording.depth_scale:g} per metre{registered}"),
         ("masks", f"{number['with_masks']} frames" if number["with_masks"] else "none"),
         ("trajectory", f"{recording.trajectory_length():.2f} m"),
         *(("note", note) for note in recording.notes),
     ]
-    if recording.depth_registration:
-        rows.insert(-1, ("", f"depth is registered to the colour camera ({recording.depth_registration})"))
     return "\n".join(f"{label:<12} {text}" for label, text in rows)
 
 

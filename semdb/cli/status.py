@@ -41,7 +41,7 @@ def command(
                 print_json([as_json(recording, failed) for recording in recordings])
             else:
                 if watch and sys.stdout.isatty():
-                    typer.clear()
+                    print("\033[2J\033[H", end="")  # clear, cursor to the top left
                 show(store, recordings, failed)
             if not watch or all(recording.state == "complete" for recording in recordings):
                 return
