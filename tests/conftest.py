@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from tests.mariadb import MariaDBError, TestServer, server
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
@@ -16,3 +20,21 @@ def shared_dir() -> Path:
     if not (folder / "recordings").is_dir():
         pytest.skip("no ../shared with real recordings and models beside the checkout")
     return folder
+
+
+@pytest.fixture(scope="session")
+def mariadb_server() -> Iterator[TestServer]:
+    """A MariaDB of the tests' own (one per process), or the server of SEMDB_TEST_MYSQL_URL; fails without either."""
+    with contextlib.ExitStack() as stack:
+        try:
+            started = stack.enter_context(server())
+        except MariaDBError as error:
+            pytest.fail(str(error), pytrace=False)
+        yield started
+
+
+@pytest.fixture
+def mariadb_url(mariadb_server: TestServer) -> Iterator[str]:
+    """The URL of a new, empty schema."""
+    with mariadb_server.schema() as url:
+        yield url

@@ -189,6 +189,7 @@ def downgrade() -> None:
         "descriptors",
         "keypoints",
         "keyframe_categories",
+        "objects",
         "categories",
         "cnn_vectors",
         "keyframe_images",
@@ -196,6 +197,7 @@ def downgrade() -> None:
         "cameras",
         "recordings",
         "map_models",
+        "models",
         "maps",
     ):
         op.drop_table(name)

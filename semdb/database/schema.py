@@ -6,9 +6,10 @@ from importlib import import_module
 from pathlib import Path
 
 from sqlalchemy import Connection, Engine, inspect, text
+from sqlalchemy.exc import SQLAlchemyError
 
 from semdb.database import retry
-from semdb.database.engine import WRITE, safe_url
+from semdb.database.engine import safe_url
 from semdb.errors import SchemaError
 
 # Ascending; the last one is what this version of semdb reads and writes. A test compares them with the scripts.
@@ -81,6 +82,9 @@ def _alembic(engine: Engine, command: str, revision: str) -> None:
     if engine.dialect.name == "sqlite":
         retry.write(engine, work)
     else:  # DDL commits by itself on these servers: Alembic records each step as it is done
-        with engine.connect().execution_options(**{WRITE: True}) as connection:
-            work(connection)
-            connection.commit()
+        try:
+            with engine.connect() as connection:
+                work(connection)
+                connection.commit()
+        except SQLAlchemyError as error:
+            raise retry.explain(engine, error) from error

@@ -1,0 +1,188 @@
+"""A MariaDB server of the tests' own: on a free loopback port, with a data directory that goes with it.
+
+`SEMDB_TEST_MYSQL_URL` names a server to use instead (an account that may create schemas and accounts; the schema in
+the URL is the prefix of those that the tests make). Nothing of an installed server's own data or settings is touched.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import itertools
+import os
+import pwd
+import secrets
+import shutil
+import signal
+import socket
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pymysql
+from sqlalchemy.engine import URL, make_url
+
+START_TIMEOUT_S = 60
+SETTINGS = (
+    "--no-defaults",
+    "--bind-address=127.0.0.1",
+    "--skip-name-resolve",
+    "--innodb-flush-log-at-trx-commit=0",
+    "--innodb-buffer-pool-size=64M",
+    "--innodb-log-file-size=16M",
+    "--innodb-lock-wait-timeout=5",
+    "--performance-schema=off",
+    "--max-allowed-packet=16M",
+)
+
+
+class MariaDBError(Exception):
+    """There is no server for the tests; the message says what is missing."""
+
+
+@dataclass
+class TestServer:
+    """A server and an account on it that may do everything."""
+
+    __test__ = False
+    admin: URL
+    prefix: str
+    _numbers: Iterator[int] = field(default_factory=itertools.count)
+
+    @contextlib.contextmanager
+    def schema(self) -> Iterator[str]:
+        """The URL of a new, empty schema, dropped in the end."""
+        name = f"{self.prefix}_{os.getpid()}_{next(self._numbers)}"
+        self.execute(f"CREATE DATABASE `{name}` CHARACTER SET utf8mb4 COLLATE utf8mb4_bin")
+        try:
+            yield self.admin.set(database=name).render_as_string(hide_password=False)
+        finally:
+            self.execute(f"DROP DATABASE IF EXISTS `{name}`")
+
+    def execute(self, *statements: str) -> None:
+        """Run statements as the administrator."""
+        with contextlib.closing(connect(self.admin)) as connection, connection.cursor() as cursor:
+            for statement in statements:
+                cursor.execute(statement)
+            connection.commit()
+
+
+def connect(url: URL) -> pymysql.Connection:
+    """A plain connection to the server of `url`, without a schema."""
+    return pymysql.connect(
+        host=url.host, port=url.port or 3306, user=url.username, password=str(url.password or ""), connect_timeout=5
+    )
+
+
+@contextlib.contextmanager
+def server() -> Iterator[TestServer]:
+    """The server for this process: the one that the environment names, or one that is started and stopped here."""
+    named = os.environ.get("SEMDB_TEST_MYSQL_URL")
+    if named:
+        url = make_url(named)
+        yield TestServer(url.set(database=None), url.database or "semdb_test")
+        return
+    programs = {name: shutil.which(name, path=os.environ.get("PATH", "") + ":/usr/sbin") for name in _PROGRAMS}
+    missing = [name for name, path in programs.items() if path is None]
+    if missing:
+        raise MariaDBError(
+            f"no {' and no '.join(missing)} here: install mariadb-server (apt-get install mariadb-server), or set "
+            "SEMDB_TEST_MYSQL_URL=mysql+pymysql://USER:PASSWORD@HOST/semdb_test"
+        )
+    # Not below pytest's own folder, which is closed to the server's user.
+    folder = Path(tempfile.mkdtemp(prefix="semdb-mariadb-", dir="/tmp"))
+    try:
+        with _started(folder, str(programs["mariadbd"]), str(programs["mariadb-install-db"])) as started:
+            yield started
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+_PROGRAMS = ("mariadbd", "mariadb-install-db")
+
+
+@contextlib.contextmanager
+def _started(folder: Path, mariadbd: str, install: str) -> Iterator[TestServer]:
+    password, port = secrets.token_hex(12), _free_port()
+    account = "'semdb_test'@'127.0.0.1'"
+    (folder / "init.sql").write_text(
+        f"CREATE USER {account} IDENTIFIED BY '{password}';\nGRANT ALL ON *.* TO {account} WITH GRANT OPTION;\n"
+    )
+    (folder / "data").mkdir()
+    user = _server_user()
+    if user is not None:
+        for path in (folder, folder / "init.sql", folder / "data"):
+            shutil.chown(path, user, user)
+    folder.chmod(0o755)
+    as_user = [f"--user={user}"] if user else []
+    made = subprocess.run(
+        [install, "--no-defaults", f"--datadir={folder / 'data'}", "--skip-test-db", *as_user],
+        capture_output=True,
+        text=True,
+        timeout=START_TIMEOUT_S,
+        check=False,
+    )
+    if made.returncode != 0:
+        raise MariaDBError(f"mariadb-install-db failed: {(made.stdout + made.stderr)[-500:]}")
+    process = subprocess.Popen(
+        [
+            mariadbd,
+            *SETTINGS,
+            f"--datadir={folder / 'data'}",
+            f"--socket={folder / 'socket'}",
+            f"--pid-file={folder / 'pid'}",
+            f"--log-error={folder / 'error.log'}",
+            f"--init-file={folder / 'init.sql'}",
+            f"--port={port}",
+        ],
+        user=user,
+        group=user,
+        extra_groups=[] if user else None,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        preexec_fn=_die_with_parent,
+    )
+    try:
+        url = URL.create("mysql+pymysql", "semdb_test", password, "127.0.0.1", port)
+        _wait(process, url, folder / "error.log")
+        yield TestServer(url, "semdb_test")
+    finally:
+        process.kill()  # nothing in it is worth a clean shutdown
+        process.wait()
+
+
+def _server_user() -> str | None:
+    """The account that the server runs under: not root; None for the one we are."""
+    if os.geteuid() != 0:
+        return None
+    try:
+        return pwd.getpwnam("mysql").pw_name
+    except KeyError as error:
+        raise MariaDBError("there is no user mysql on this machine: install mariadb-server") from error
+
+
+def _die_with_parent() -> None:
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG: a killed test run leaves no server behind
+
+
+def _free_port() -> int:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return int(listener.getsockname()[1])
+
+
+def _wait(process: subprocess.Popen[bytes], url: URL, log: Path) -> None:
+    deadline = time.monotonic() + START_TIMEOUT_S
+    while time.monotonic() < deadline:
+        if process.poll() is not None:
+            break
+        try:
+            connect(url).close()
+            return
+        except pymysql.err.OperationalError:
+            time.sleep(0.05)
+    tail = log.read_text(errors="replace")[-800:] if log.exists() else "no log"
+    raise MariaDBError(f"the test server did not start: {tail}")
