@@ -1,0 +1,46 @@
+"""`semdb synth`: render a room as a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def command(
+    directory: Annotated[Path, typer.Argument(metavar="DIR", help="A folder that is new or empty.")],
+    frames: Annotated[int, typer.Option(help="Number of frames.")] = 120,
+    width: Annotated[int, typer.Option(help="Pixels.")] = 640,
+    height: Annotated[int, typer.Option(help="Pixels.")] = 480,
+    seed: Annotated[int, typer.Option(help="The walk, the noise and the change of lighting.")] = 0,
+    room_seed: Annotated[int, typer.Option(help="Furniture, layout and textures.")] = 0,
+    noise: Annotated[bool, typer.Option("--noise", help="Noise of colour and depth as of a real sensor.")] = False,
+    blur: Annotated[
+        float, typer.Option(metavar="0..1", help="Motion blur: share of the time that the shutter is open.")
+    ] = 0.0,
+    lighting: Annotated[float, typer.Option(metavar="0..1", help="How much the lighting is changed.")] = 0.0,
+    second_visit: Annotated[
+        bool, typer.Option("--second-visit", help="Another walk through the same room, some objects moved.")
+    ] = False,
+    lap_frames: Annotated[int, typer.Option(help="Frames in which the camera turns once around.")] = 120,
+) -> None:
+    """Render a furnished room along a smooth walk: colour, exact depth, poses and object masks in the TUM layout."""
+    from semdb.cli.progress import Progress
+    from semdb.recordings.synthetic import SyntheticOptions, write_synthetic_recording
+
+    options = SyntheticOptions(
+        frames=frames,
+        width=width,
+        height=height,
+        seed=seed,
+        room_seed=room_seed,
+        noise=noise,
+        blur=blur,
+        lighting=lighting,
+        second_visit=second_visit,
+        lap_frames=lap_frames,
+    )
+    with Progress("rendering") as progress:
+        write_synthetic_recording(directory, options, progress.update)
+    print(f"wrote {frames} frames of {width}x{height} to {directory}")
