@@ -1,0 +1,57 @@
+"""What a synthetic recording is made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from semdb.errors import UsageError
+from semdb.types import Camera
+
+FOCAL_PER_WIDTH = 0.82  # fx / width: 62.7 degrees from left to right, as the sensors of TUM RGB-D and 7-Scenes
+DEPTH_SCALE = 5000.0
+FRAME_RATE_HZ = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class SyntheticOptions:
+    """Options of `write_synthetic_recording`. Equal options make equal files.
+
+    `room_seed` chooses furniture, layout and textures; `seed` the walk through the room, the noise and the lighting
+    change. `lap_frames` is the number of frames in which the camera turns once around itself.
+    `blur` is the share of the time between two frames during which the shutter is open. `lighting` scales a change
+    of gain, colour and direction of the light (1 is strong). `second_visit` walks another way, some objects moved.
+    """
+
+    frames: int = 120
+    width: int = 640
+    height: int = 480
+    seed: int = 0
+    room_seed: int = 0
+    noise: bool = False
+    blur: float = 0.0
+    lighting: float = 0.0
+    second_visit: bool = False
+    lap_frames: int = 120
+
+    def __post_init__(self) -> None:
+        """Raises UsageError naming the option that makes no sense."""
+        limits: tuple[tuple[str, float, float], ...] = (
+            ("frames", 1, 1_000_000),
+            ("width", 16, 4096),
+            ("height", 16, 4096),
+            ("seed", 0, 2**32 - 1),
+            ("room_seed", 0, 2**32 - 1),
+            ("blur", 0.0, 1.0),
+            ("lighting", 0.0, 1.0),
+            ("lap_frames", 8, 1_000_000),
+        )
+        for name, low, high in limits:
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise UsageError(f"synthetic recording: {name} = {value} is outside {low:g} to {high:g}")
+
+    @property
+    def camera(self) -> Camera:
+        """The pinhole camera that the recording is rendered with."""
+        focal = FOCAL_PER_WIDTH * self.width
+        return Camera(self.width, self.height, focal, focal, (self.width - 1) / 2, (self.height - 1) / 2)

@@ -1,0 +1,149 @@
+"""Baked light, culling and the call of the compiled renderer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semdb.recordings.synthetic.scene import Int64Array, PackedScene
+from semdb.types import BoolArray, Camera, Float32Array, FloatArray, ImageArray
+
+AMBIENT_REACH = 0.9  # metres: nearer surfaces take away ambient light
+DIRECTIONS = 48
+LEAF = 4  # primitives
+_EXPOSURE = 1.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lamp:
+    """A rectangular light: `pose` with y as its normal, size in metres, linear colour."""
+
+    pose: FloatArray
+    width: float
+    height: float
+    colour: tuple[float, float, float]
+    samples: tuple[int, int]
+
+
+def _lamp_points(lamps: list[Lamp]) -> FloatArray:
+    """Sample points ``[l, 9]``: position, normal, colour."""
+    rows = []
+    for lamp in lamps:
+        nx, nz = lamp.samples
+        for i in range(nx):
+            for k in range(nz):
+                local = [((i + 0.5) / nx - 0.5) * lamp.width, 0.0, ((k + 0.5) / nz - 0.5) * lamp.height]
+                at = lamp.pose[:3, :3] @ local + lamp.pose[:3, 3]
+                rows.append([*at, *lamp.pose[:3, 1], *(c / (nx * nz) for c in lamp.colour)])
+    return np.array(rows, np.float64).reshape(-1, 9)
+
+
+def _hemisphere(count: int) -> FloatArray:
+    """Cosine-weighted directions about +z ``[count, 3]`` on a spiral."""
+    k = np.arange(count) + 0.5
+    r, angle = np.sqrt(k / count), k * 2.399963229728653
+    return np.stack([r * np.cos(angle), r * np.sin(angle), np.sqrt(1 - r * r)], axis=1)
+
+
+def _hierarchy(low: FloatArray, high: FloatArray) -> tuple[FloatArray, Int64Array, Int64Array]:
+    """Bounding volume hierarchy by median splits: boxes ``[m, 6]``, links ``[m, 2]`` (first, count), order ``[n]``.
+
+    A node with count 0 has its children at `first` and `first + 1`; otherwise it holds ``order[first : first + count]``.
+    """
+    order = np.arange(len(low))
+    boxes: list[FloatArray] = [np.zeros(6)]
+    links: list[tuple[int, int]] = [(0, 0)]
+    todo = [(0, 0, len(low))]
+    while todo:
+        node, start, stop = todo.pop()
+        ids = order[start:stop]
+        boxes[node] = np.concatenate([low[ids].min(axis=0), high[ids].max(axis=0)])
+        if stop - start <= LEAF:
+            links[node] = (start, stop - start)
+            continue
+        centres = low[ids] + high[ids]
+        axis = int(np.argmax(np.ptp(centres, axis=0)))
+        order[start:stop] = ids[np.argsort(centres[:, axis], kind="stable")]
+        middle, child = (start + stop) // 2, len(boxes)
+        links[node] = (child, 0)
+        boxes += [np.zeros(6), np.zeros(6)]
+        links += [(0, 0), (0, 0)]
+        todo += [(child, start, middle), (child + 1, middle, stop)]
+    return np.array(boxes), np.array(links, np.int64), order.astype(np.int64)
+
+
+def bake_light(scene: PackedScene, lamps: list[Lamp]) -> PackedScene:
+    """`scene` with the light of `lamps`, their soft shadows and ambient occlusion. Depends on nothing that moves."""
+    from semdb.recordings.synthetic import kernels
+
+    boxes, links, order = _hierarchy(scene.box_low, scene.box_high)
+    light = np.zeros(scene.light.shape, np.float64)
+    world = (scene.kind, scene.rotation, scene.centre, scene.half, scene.top)
+    mean = np.minimum(scene.mean, 1.0)
+    directions = _hemisphere(DIRECTIONS)
+    kernels.bake(
+        boxes, links, order, world, scene.light_map, mean, _lamp_points(lamps), directions, AMBIENT_REACH, 0.85, light
+    )
+    # textures are kept as displayed (gamma 2.2), so light is brought to the same scale
+    shown = (_EXPOSURE * light) ** (1 / 2.2)
+    return replace(scene, light=shown.astype(np.float32))
+
+
+def _cull(scene: PackedScene, camera: Camera, pose: FloatArray, tile: int) -> tuple[Int64Array, Int64Array, FloatArray]:
+    """Which primitives each tile of the image may show: ranges ``[rows, cols, 2]`` in ids, sorted by least depth."""
+    corners = np.stack([np.where(k, scene.box_high, scene.box_low) for k in _CORNERS], axis=1)  # [n, 8, 3]
+    local = (corners - pose[:3, 3]) @ pose[:3, :3]
+    z = local[..., 2]
+    near = z.min(axis=1)
+    rows, cols = -(-camera.height // tile), -(-camera.width // tile)
+    crosses = near < 0.02
+    zs = np.maximum(z, 0.02)
+    u, v = camera.fx * local[..., 0] / zs + camera.cx, camera.fy * local[..., 1] / zs + camera.cy
+    u0, u1 = np.where(crosses, 0, u.min(axis=1) - 1), np.where(crosses, camera.width, u.max(axis=1) + 1)
+    v0, v1 = np.where(crosses, 0, v.min(axis=1) - 1), np.where(crosses, camera.height, v.max(axis=1) + 1)
+    seen = (z.max(axis=1) > 0) & (u1 >= 0) & (v1 >= 0) & (u0 <= camera.width) & (v0 <= camera.height)
+    c0, c1 = np.clip(u0 // tile, 0, cols - 1), np.clip(u1 // tile, 0, cols - 1)
+    r0, r1 = np.clip(v0 // tile, 0, rows - 1), np.clip(v1 // tile, 0, rows - 1)
+    near = np.maximum(near, 0.0)
+    order = np.flatnonzero(seen)[np.argsort(near[seen], kind="stable")]
+    grid = np.zeros((rows, cols, len(order)), np.bool_)
+    for k, i in enumerate(order):
+        grid[int(r0[i]) : int(r1[i]) + 1, int(c0[i]) : int(c1[i]) + 1, k] = True
+    counts = grid.sum(axis=2)
+    stop = np.cumsum(counts.ravel()).reshape(rows, cols)
+    tiles = np.stack([stop - counts, stop], axis=2).astype(np.int64)
+    ids = np.broadcast_to(order, grid.shape)[grid].astype(np.int64)
+    return tiles, ids, near
+
+
+_CORNERS: list[BoolArray] = [np.array([k & 1, k & 2, k & 4]) > 0 for k in range(8)]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """What the renderer makes of one pose: all of the same pixel centres."""
+
+    rgb: ImageArray  # [H, W, 3]
+    depth: Float32Array  # [H, W] metres along z, 0 for none
+    labels: npt.NDArray[np.uint16]  # [H, W]
+
+
+def render_view(scene: PackedScene, camera: Camera, world_from_camera: FloatArray) -> View:
+    """Renders `scene`, whose light is baked, for a pinhole `camera`. Releases the interpreter's lock while it works."""
+    from semdb.recordings.synthetic import kernels
+
+    tiles, ids, near = _cull(scene, camera, world_from_camera, kernels.TILE)
+    origin = np.einsum("nij,nj->ni", scene.rotation, world_from_camera[:3, 3] - scene.centre)
+    turn = np.ascontiguousarray(scene.rotation @ world_from_camera[:3, :3])
+    arrays: tuple[Any, ...] = (scene.kind, scene.half, scene.top, scene.texture, scene.uv, scene.light_map, scene.tint)
+    arrays = (*arrays, scene.texels, scene.table, scene.light)
+    rgb = np.zeros((camera.height, camera.width, 3), np.uint8)
+    depth = np.zeros((camera.height, camera.width))
+    prims = np.full((camera.height, camera.width), -1, np.int32)
+    lens = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
+    kernels.render(arrays, tiles, ids, origin, turn, near, lens, rgb, depth, prims)
+    labels = np.where(prims >= 0, scene.label[np.maximum(prims, 0) // 8], 0).astype(np.uint16)
+    return View(rgb, depth.astype(np.float32), labels)

@@ -1,0 +1,157 @@
+"""Writes a synthetic recording to disk in the TUM RGB-D layout, with camera and instance masks."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from semdb.errors import UsageError
+from semdb.geometry import quat_wxyz_from_rotation
+from semdb.recordings.synthetic import sensor
+from semdb.recordings.synthetic.options import DEPTH_SCALE, FRAME_RATE_HZ, SyntheticOptions
+from semdb.recordings.synthetic.render import Lamp, bake_light, render_view
+from semdb.recordings.synthetic.room import Room, build_room
+from semdb.recordings.synthetic.scene import PackedScene, pack, yaw_pose
+from semdb.recordings.synthetic.trajectory import walk
+from semdb.recordings.synthetic.visit import move_objects
+from semdb.types import Float32Array, FloatArray, ImageArray
+
+_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 3]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SyntheticFrame:
+    """One frame before it is written: uint8 RGB, depth in metres (0 for none), labels, world_from_camera."""
+
+    rgb: ImageArray  # [H, W, 3]
+    depth: Float32Array  # [H, W]
+    labels: npt.NDArray[np.uint16]  # [H, W]
+    world_from_camera: FloatArray  # [4, 4]
+
+
+@lru_cache(maxsize=2)
+def _scene(room_seed: int, visit_seed: int | None) -> tuple[Room, PackedScene, tuple[int, ...]]:
+    """The lit room of a first (`visit_seed` None) or second visit, and the labels of what was moved."""
+    room = build_room(room_seed)
+    moved = [] if visit_seed is None else move_objects(room, visit_seed, room_seed)
+    return room, bake_light(pack(room.items), _lamps(room)), tuple(moved)
+
+
+def _lamps(room: Room) -> list[Lamp]:
+    """The lamp under the ceiling and the windows."""
+    down = np.eye(4)
+    down[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]  # its y axis points down
+    lamps = [Lamp(yaw_pose(0, 0, room.size[2] - 0.07) @ down, 1.2, 0.35, (2.3, 2.1, 1.8), (4, 2))]
+    for pose, width, height in room.windows:
+        lamps.append(Lamp(pose, width, height, (1.7, 1.9, 2.2), (3, 3)))
+    return lamps
+
+
+class SyntheticSequence:
+    """The frames of a synthetic recording, rendered when asked for. Thread-safe: frames do not depend on each other."""
+
+    def __init__(self, options: SyntheticOptions) -> None:
+        self.options = options
+        self.camera = options.camera
+        visit = options.seed if options.second_visit else None
+        self.room, self._packed, self.moved = _scene(options.room_seed, visit)
+        # one more pose than frames: the blur of the last frame needs where the camera goes next
+        poses = walk(self.room, options.frames + 1, options.lap_frames, options.seed, options.second_visit)
+        self._poses = poses
+        self.poses: FloatArray = poses[:-1]
+
+    @property
+    def classes(self) -> dict[int, str]:
+        """COCO-style class name of each label."""
+        return self.room.classes()
+
+    def timestamp(self, index: int) -> float:
+        """Seconds."""
+        return 1.0 + index / FRAME_RATE_HZ
+
+    def render(self, index: int) -> SyntheticFrame:
+        """Frame `index` with all effects of the options."""
+        options, pose = self.options, self._poses[index]
+        view = render_view(self._packed, self.camera, pose)
+        rgb, depth = view.rgb, view.depth
+        if options.lighting > 0:
+            rgb = sensor.change_light(rgb, depth, self.camera, pose, options.lighting, options.seed, index)
+        if options.blur > 0:
+            rgb = sensor.motion_blur(rgb, depth, self.camera, pose, self._poses[index + 1], options.blur)
+        if options.noise:
+            rng = np.random.default_rng([options.seed, 5, index])
+            rgb, depth = sensor.noisy_image(rgb, rng), sensor.noisy_depth(depth, self.camera, rng)
+        return SyntheticFrame(rgb, depth, view.labels, pose)
+
+
+def write_synthetic_recording(
+    directory: Path, options: SyntheticOptions, progress: Callable[[int, int], None] | None = None
+) -> None:
+    """Renders a recording into `directory`, which must be empty or absent (UsageError otherwise).
+
+    All or nothing: frames are written to a folder beside it, which then takes its name; `progress` gets frames done
+    and frames in all. The layout is described in docs/synthetic.md.
+    """
+    directory = Path(directory)
+    if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
+        raise UsageError(f"{directory}: is not empty; give a new or empty folder for the synthetic recording")
+    target = directory.resolve()
+    target.parent.mkdir(parents=True, exist_ok=True)
+    work = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+    try:
+        _write_all(work, SyntheticSequence(options), progress)
+        work.chmod(0o755)
+        work.replace(target)  # an empty folder gives way, a full one does not
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def _write_all(folder: Path, sequence: SyntheticSequence, progress: Callable[[int, int], None] | None) -> None:
+    options, camera = sequence.options, sequence.camera
+    for name in ("rgb", "depth", "masks"):
+        (folder / name).mkdir()
+    stems = [f"{sequence.timestamp(i):.6f}" for i in range(options.frames)]
+    with ThreadPoolExecutor(min(len(os.sched_getaffinity(0)), 8)) as pool:
+        jobs = [pool.submit(_write_frame, folder, stems[i], sequence, i) for i in range(options.frames)]
+        try:
+            for done, job in enumerate(as_completed(jobs), 1):
+                job.result()
+                if progress is not None:
+                    progress(done, options.frames)
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+    for name in ("rgb", "depth"):
+        rows = [f"{stem} {name}/{stem}.png" for stem in stems]
+        (folder / f"{name}.txt").write_text("\n".join(["# synthetic recording", "# timestamp filename", *rows, ""]))
+    rows = ["# synthetic recording", "# timestamp tx ty tz qx qy qz qw"]
+    for stem, pose in zip(stems, sequence.poses, strict=True):
+        w, x, y, z = quat_wxyz_from_rotation(pose[:3, :3])
+        rows.append(" ".join([stem, *(repr(float(v)) for v in (*pose[:3, 3], x, y, z, w))]))
+    (folder / "groundtruth.txt").write_text("\n".join([*rows, ""]))
+    lens = {"width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy, "cx": camera.cx}
+    lens |= {"cy": camera.cy, "distortion": [], "depth_scale": int(DEPTH_SCALE)}
+    (folder / "camera.json").write_text(json.dumps(lens, indent=2) + "\n")
+    classes = {str(label): name for label, name in sorted(sequence.classes.items())}
+    (folder / "masks" / "classes.json").write_text(json.dumps(classes, indent=0) + "\n")
+
+
+def _write_frame(folder: Path, stem: str, sequence: SyntheticSequence, index: int) -> None:
+    frame = sequence.render(index)
+    units = np.clip(np.rint(frame.depth.astype(np.float64) * DEPTH_SCALE), 0, 65535).astype(np.uint16)
+    images = (("rgb", np.ascontiguousarray(frame.rgb[..., ::-1])), ("depth", units), ("masks", frame.labels))
+    for name, image in images:
+        path = folder / name / f"{stem}.png"
+        if not cv2.imwrite(str(path), image, _PNG):
+            raise OSError(f"{path}: cannot be written")
