@@ -10,7 +10,7 @@ from . import INGEST_TASK, app
 
 @app.task(name=INGEST_TASK)  # type: ignore[untyped-decorator]
 def ingest_recording(
-    path: str, map_name: str = "default", name: str | None = None, options: Mapping[str, Any] | None = None
+    path: str, map_name: str | None = None, name: str | None = None, options: Mapping[str, Any] | None = None
 ) -> list[dict[str, Any]]:
     """Ingest the recording at `path`, which the worker must see under that path.
 
