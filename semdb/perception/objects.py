@@ -11,7 +11,7 @@ import numpy.typing as npt
 from semdb.geometry import back_project
 from semdb.types import BoolArray, Camera, Detection, Features, Float32Array, IntArray, ObjectGeometry
 
-_MAX_POINTS = 4000  # per object: percentiles of more are no better and cost time
+_MAX_POINTS = 1000  # per object: percentiles of more are no better and cost time
 _BORDER = 2  # pixels at the rim of a mask whose depth is often that of the background
 _MIN_POINTS = 10
 
@@ -76,8 +76,9 @@ def object_geometry(camera: Camera, depth: Float32Array | None, detection: Detec
     v, u = np.nonzero(chosen)
     if len(u) < _MIN_POINTS:
         return nowhere
-    step = -(-len(u) // _MAX_POINTS)
-    v, u = v[::step], u[::step]
+    if len(u) > _MAX_POINTS:  # evenly, but with no whole step that would fall in with the width of the mask
+        rows = np.linspace(0, len(u) - 1, _MAX_POINTS).astype(np.intp)
+        v, u = v[rows], u[rows]
     points = back_project(camera, np.column_stack([u + x, v + y]), part[v, u])
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < _MIN_POINTS:

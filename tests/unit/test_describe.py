@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from semdb.errors import FrameError, ModelError, UsageError
-from semdb.perception.describe import Describer
+from semdb.geometry import project
+from semdb.perception.describe import Describer, describer_from_specs
 from semdb.perception.detectors import load_detector
 from semdb.perception.encoders import load_encoder
 from semdb.perception.objects import assign_to_objects, object_geometry, sort_by_object
@@ -55,8 +56,8 @@ def detection(mask: np.ndarray, category: str = "cup") -> Detection:
     return Detection(category, 0.9, np.array([0, 0, 1, 1], dtype=np.float32), mask)
 
 
-def describer(**more: bool) -> Describer:
-    return Describer(load_detector("recorded", SETTINGS), load_encoder("gist", SETTINGS), GridFeatures(), **more)
+def describer() -> Describer:
+    return Describer(load_detector("recorded", SETTINGS), load_encoder("gist", SETTINGS), GridFeatures())
 
 
 def scene() -> tuple[np.ndarray, np.ndarray, InstanceMasks]:
@@ -173,37 +174,53 @@ def test_sizes_must_agree() -> None:
         describer().describe(image, depth, Camera(640, 480, 525, 525, 319.5, 239.5), instances)
 
 
-@pytest.mark.parametrize("beside", [False, True])
-def test_errors_of_a_detector_come_through(beside: bool) -> None:
+def test_recorded_needs_masks() -> None:
     image, depth, _ = scene()
     with pytest.raises(UsageError, match="brings no masks"):
-        describer(beside=beside).describe(image, depth, CAMERA)
+        describer().describe(image, depth, CAMERA)
 
 
-@pytest.mark.parametrize("beside", [False, True])
-def test_errors_of_an_encoder_come_through_and_the_next_image_is_described(beside: bool) -> None:
-    class BreaksOnce:
-        info = ModelInfo("encoder", "breaks", "")
-        calls = 0
+def test_an_image_without_objects_or_keypoints() -> None:
+    image, labels = np.full((120, 160, 3), 90, dtype=np.uint8), np.zeros((120, 160), dtype=np.uint16)
+    one = describer_from_specs("recorded", "gist", "surf", SETTINGS)
+    found = one.describe(image, np.ones((120, 160), dtype=np.float32), CAMERA, InstanceMasks(labels, {}))
+    assert found.detections == ()
+    assert len(found.keypoints) == 0
+    assert found.keypoints.points.shape == (0, 3)
+    assert found.cnn_vector.shape == (560,)
 
-        def encode(self, image: ImageArray) -> np.ndarray:
-            self.calls += 1
-            if self.calls == 1:
-                raise ModelError("broken")
-            return np.ones(1, dtype=np.float32)
 
+@pytest.mark.parametrize(("features", "width"), [("surf", 64), ("sift", 128), ("orb", 32)])
+def test_describer_from_specs(features: str, width: int) -> None:
     image, depth, instances = scene()
-    one = Describer(load_detector("recorded", SETTINGS), BreaksOnce(), GridFeatures(), beside=beside)
-    with pytest.raises(ModelError, match="broken"):
-        one.describe(image, depth, CAMERA, instances)
-    assert len(one.describe(image, depth, CAMERA, instances).detections) == 2
+    one = describer_from_specs("recorded", "gist", features, SETTINGS)
+    found = one.describe(image, depth, CAMERA, instances)
+    assert [model.name for model in one.models[:2]] == ["recorded", "gist"]
+    assert one.models[2].role == "features"
+    assert found.models == one.models
+    points, xy = found.keypoints.points, found.keypoints.features.xy
+    assert found.keypoints.features.descriptors.shape == (len(found.keypoints), width)
+    lifted = np.isfinite(points[:, 2])
+    assert lifted.sum() > 30
+    np.testing.assert_allclose(project(CAMERA, points[lifted]), xy[lifted], atol=1e-3)
+    owner = assign_to_objects(xy, [d.mask for d in found.detections])
+    np.testing.assert_array_equal(found.keypoints.object_index, owner)
+
+
+def test_describer_from_specs_names_what_is_wrong() -> None:
+    with pytest.raises(ModelError, match=r"no model file at /nowhere/m\.onnx"):
+        describer_from_specs("onnx:/nowhere/m.onnx", "gist", "surf", SETTINGS)
+    with pytest.raises(UsageError, match="no encoder 'auto'"):
+        describer_from_specs("recorded", "auto", "surf", SETTINGS)
 
 
 def assert_same(first: Description, second: Description) -> None:
     np.testing.assert_array_equal(first.cnn_vector, second.cnn_vector)
     np.testing.assert_array_equal(first.keypoints.object_index, second.keypoints.object_index)
     np.testing.assert_array_equal(first.keypoints.points, second.keypoints.points)
-    np.testing.assert_array_equal(first.keypoints.features.xy, second.keypoints.features.xy)
+    for name in ("xy", "size", "angle", "response", "laplacian", "descriptors"):
+        one_side, other_side = getattr(first.keypoints.features, name), getattr(second.keypoints.features, name)
+        np.testing.assert_array_equal(one_side, other_side)
     assert [(d.category, d.score) for d in first.detections] == [(d.category, d.score) for d in second.detections]
     for one, other in zip(first.detections, second.detections, strict=True):
         np.testing.assert_array_equal(one.mask, other.mask)
@@ -216,21 +233,18 @@ def test_real_frames_are_described_alike_with_any_threads(shared_dir: Path) -> N
     models = shared_dir / "models"
     camera = Camera(640, 480, 525, 525, 319.5, 239.5)
 
-    def make(threads: int, beside: bool) -> Describer:
-        return Describer(
-            load_detector(f"onnx:{models}/mask_rcnn_2go.onnx", SETTINGS, threads),
-            load_encoder(f"onnx:{models}/squeezenet_places365.onnx", SETTINGS, threads),
-            GridFeatures(),
-            beside=beside,
-        )
+    def make(threads: int) -> Describer:
+        specs = f"onnx:{models}/mask_rcnn_2go.onnx", f"onnx:{models}/squeezenet_places365.onnx", "surf"
+        return describer_from_specs(*specs, Settings(threads=threads))
 
-    alone, beside = make(1, False), make(2, True)
+    alone, together = make(1), make(2)
+    assert alone.models == together.models
     scene_dir = shared_dir / "recordings" / "7scenes_redkitchen" / "seq-01"
     for number in (0, 500):
         image = cv2.imread(str(scene_dir / f"frame-{number:06d}.color.jpg"))[..., ::-1].copy()
         depth = cv2.imread(str(scene_dir / f"frame-{number:06d}.depth.png"), cv2.IMREAD_UNCHANGED) / np.float32(1000)
         depth[(depth == 0) | (depth > 60)] = np.nan
-        first, second = alone.describe(image, depth, camera), beside.describe(image, depth, camera)
+        first, second = alone.describe(image, depth, camera), together.describe(image, depth, camera)
         assert_same(first, second)
         assert "dining table" in first.category_counts
         assert (first.keypoints.object_index >= 0).sum() > 500

@@ -114,7 +114,7 @@ def test_onnx_info_names_the_file_without_its_folder(tmp_path: Path) -> None:
     assert (info.role, info.name) == ("detector", "onnx:three.onnx")
     assert info.sha256 == hashlib.sha256((tmp_path / "three.onnx").read_bytes()).hexdigest()
     assert json.loads(info.config) == {"mask_threshold": 0.5, "score_threshold": 0.5}
-    assert load_detector(spec, settings(0.5), threads=2).info == info
+    assert load_detector(spec, Settings(score_threshold=0.5, threads=2)).info == info
     assert load_detector(spec, settings(0.6)).info != info
 
 

@@ -7,10 +7,10 @@ from semdb.perception.protocols import Detector
 from semdb.settings import Settings
 
 
-def load_detector(spec: str, settings: Settings, threads: int | None = None) -> Detector:
+def load_detector(spec: str, settings: Settings) -> Detector:
     """The detector of a `spec`: ``onnx:FILE`` or ``recorded``.
 
-    `threads` are those of the network, by default ``settings.threads``; they do not change the result.
+    The network runs on ``settings.threads`` threads; their number does not change the result.
     Raises UsageError for a spec that is none, ModelError when its file is missing or is no Mask R-CNN.
     """
     if spec == "recorded":
@@ -20,7 +20,7 @@ def load_detector(spec: str, settings: Settings, threads: int | None = None) -> 
     if spec.startswith("onnx:"):
         from semdb.perception.detectors.onnx import OnnxDetector
 
-        return OnnxDetector(spec, settings, threads or settings.threads)
+        return OnnxDetector(spec, settings)
     if spec.startswith("torchvision:"):
         raise ModelError(
             f"{spec!r}: torch models come with `pip install semdb[torch]`, but this version of semdb runs Mask R-CNN "

@@ -26,9 +26,9 @@ class OnnxDetector:
     dropped.
     """
 
-    def __init__(self, spec: str, settings: Settings, threads: int) -> None:
+    def __init__(self, spec: str, settings: Settings) -> None:
         path = resolve_onnx(spec, settings)
-        self._model = OnnxModel(path, threads, _OUTPUTS)
+        self._model = OnnxModel(path, settings.threads, _OUTPUTS)
         self._classes = _class_names(self._model)
         self._score_threshold = settings.score_threshold
         config = {"mask_threshold": MASK_THRESHOLD, "score_threshold": settings.score_threshold}

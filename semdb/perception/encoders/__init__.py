@@ -7,10 +7,10 @@ from semdb.perception.protocols import Encoder
 from semdb.settings import Settings
 
 
-def load_encoder(spec: str, settings: Settings, threads: int | None = None) -> Encoder:
+def load_encoder(spec: str, settings: Settings) -> Encoder:
     """The encoder of a `spec`: ``onnx:FILE`` or ``gist``.
 
-    `threads` are those of the network, by default ``settings.threads``; they do not change the result.
+    The network runs on ``settings.threads`` threads; their number does not change the result.
     Raises UsageError for a spec that is none, ModelError when its file is missing or is no encoder.
     """
     if spec == "gist":
@@ -20,7 +20,7 @@ def load_encoder(spec: str, settings: Settings, threads: int | None = None) -> E
     if spec.startswith("onnx:"):
         from semdb.perception.encoders.onnx import OnnxEncoder
 
-        return OnnxEncoder(spec, settings, threads or settings.threads)
+        return OnnxEncoder(spec, settings)
     if spec.startswith("torchvision:"):
         raise ModelError(
             f"{spec!r}: torch models come with `pip install semdb[torch]`, but this version of semdb runs encoders "

@@ -17,9 +17,9 @@ CROP = 224
 class OnnxEncoder:
     """A network ``[B, 3, 224, 224]`` RGB 0..1 to ``embedding`` ``[B, d]``, on the centre of the image."""
 
-    def __init__(self, spec: str, settings: Settings, threads: int) -> None:
+    def __init__(self, spec: str, settings: Settings) -> None:
         path = resolve_onnx(spec, settings)
-        self._model = OnnxModel(path, threads, ("embedding",))
+        self._model = OnnxModel(path, settings.threads, ("embedding",))
         config = canonical_json({"crop": CROP, "short_side": SHORT_SIDE})
         self.info = ModelInfo("encoder", f"onnx:{path.name}", file_sha256(path), config)
 
