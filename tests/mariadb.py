@@ -143,7 +143,7 @@ def _started(folder: Path, mariadbd: str, install: str) -> Iterator[TestServer]:
         extra_groups=[] if user else None,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
-        preexec_fn=_die_with_parent,
+        preexec_fn=_die_with_parent,  # noqa: PLW1509 (the fixture starts before any thread of a test)
     )
     try:
         url = URL.create("mysql+pymysql", "semdb_test", password, "127.0.0.1", port)

@@ -145,8 +145,10 @@ def upgrade() -> None:
         "INSERT INTO keyframe_changes (map_id, keyframe_id, kind) "
         "SELECT r.map_id, k.id, 'added' FROM keyframes k JOIN recordings r ON r.id = k.recording_id ORDER BY k.id"
     )
+    # On a server a view otherwise runs with the rights of whoever made it, and dies with that account.
+    security = "" if op.get_bind().dialect.name == "sqlite" else "SQL SECURITY INVOKER"
     for name, statement in VIEWS.items():
-        op.execute(f"CREATE VIEW {name} AS {statement}")
+        op.execute(f"CREATE {security} VIEW {name} AS {statement}")
 
 
 def downgrade() -> None:

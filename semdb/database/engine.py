@@ -49,7 +49,7 @@ def make_engine(url: str, *, read_timeout_s: int | None = None) -> Engine:
     parsed = parse_url(url)
     if parsed.get_backend_name() == "sqlite":
         return _sqlite_engine(parsed)
-    return _server_engine(parsed, read_timeout_s)
+    return make_server_engine(parsed, read_timeout_s)
 
 
 def _sqlite_engine(url: URL) -> Engine:
@@ -74,7 +74,8 @@ def _sqlite_engine(url: URL) -> Engine:
     return engine
 
 
-def _server_engine(url: URL, read_timeout_s: int | None) -> Engine:
+def make_server_engine(url: URL, read_timeout_s: int | None = None) -> Engine:
+    """An engine for a server; its URL may leave out the schema."""
     arguments: dict[str, Any] = {"connect_timeout": CONNECT_TIMEOUT_S, "charset": "utf8mb4"}
     if read_timeout_s is not None:
         arguments["read_timeout"] = read_timeout_s

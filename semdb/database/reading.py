@@ -186,11 +186,16 @@ def _keyframe(rows: dict[str, dict[int, Any]], key: int, with_descriptors: bool)
         recording=row.recording,
         frame_index=row.frame_index,
         timestamp_ns=row.timestamp_ns,
-        camera=Camera(row.width, row.height, row.fx, row.fy, row.cx, row.cy, tuple(json.loads(row.distortion))),
+        camera=camera_from_row(row),
         world_from_camera=_pose(row),
         objects=tuple(_object(item) for item in object_rows),
         keypoints=decode_keypoints(blob, described, object_index, f"keypoints of keyframe {key}"),
     )
+
+
+def camera_from_row(row: Any) -> Camera:
+    """The camera of a row that has the columns of `cameras`."""
+    return Camera(row.width, row.height, row.fx, row.fy, row.cx, row.cy, tuple(json.loads(row.distortion)))
 
 
 def _object(row: Any) -> StoredObject:

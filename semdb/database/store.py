@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from sqlalchemy import Engine, select
 
-from semdb.database import class_filter, deletion, planning, reading, reporting, retry, schema
+from semdb.database import class_filter, deletion, lookups, planning, reading, reporting, retry, schema
 from semdb.database.engine import make_engine, parse_url, safe_url, sqlite_path
 from semdb.database.ids import SharedIds
 from semdb.database.records import (
@@ -27,7 +27,7 @@ from semdb.database.records import (
 from semdb.database.tables import recordings
 from semdb.database.writing import KeyframeWriter
 from semdb.errors import NotFoundError, SchemaError
-from semdb.types import BoolArray, Float32Array, FloatArray, Localization, ModelInfo
+from semdb.types import BoolArray, Camera, Float32Array, FloatArray, Localization, ModelInfo
 
 Progress = Callable[[int, int], None]
 
@@ -174,6 +174,22 @@ class Store:
     def changes_since(self, map_id: int, change_id: int) -> list[Change]:
         """Changes of a map's keyframes after `change_id` (0: all), ascending."""
         return reading.changes_since(self.engine, map_id, change_id)
+
+    def planned_frames(self, map_name: str, recording: str) -> tuple[int, ...]:
+        """Frame indexes of the stored plan of a recording, ascending; empty where there is none."""
+        return lookups.planned_frames(self.engine, map_name, recording)
+
+    def cameras(self, map_id: int) -> list[Camera]:
+        """The different cameras of a map's keyframes."""
+        return lookups.map_cameras(self.engine, map_id)
+
+    def recording_camera(self, recording_id: int) -> tuple[Camera, float | None]:
+        """Camera and depth scale of a recording. Raises NotFoundError without keyframes."""
+        return lookups.recording_camera(self.engine, recording_id)
+
+    def category_counts(self, map_id: int) -> list[tuple[int, str, int]]:
+        """Keyframe id, class and number of objects, of every keyframe of a map that shows any."""
+        return lookups.category_counts(self.engine, map_id)
 
     # deletion and log
 
