@@ -20,10 +20,36 @@ def command(
     ] = False,
 ) -> None:
     """Create the schema, or upgrade it; nothing happens when it is there already."""
-    settings = overrides.settings()
-    if accounts or execute:
-        raise NotImplementedError
-    _init(settings.database_url)
+    from semdb.errors import UsageError
+
+    url = overrides.settings().database_url
+    if execute and not accounts:
+        raise UsageError("--execute goes with --accounts")
+    if accounts:
+        _accounts(url, execute)
+    else:
+        _init(url)
+
+
+def _accounts(url: str, execute: bool) -> None:
+    """Print statements and URLs as SQL with comments; with `execute` run them and print the URLs only."""
+    from semdb.database.accounts import execute as run_statements
+    from semdb.database.accounts import plan_accounts
+
+    plan = plan_accounts(url)
+    if execute:
+        run_statements(url, plan.statements)
+        print("created the accounts; nothing else remembers their passwords:")
+    else:
+        for statement in plan.statements:
+            print(f"{statement};")
+    variables = {
+        "owner": "SEMDB_DATABASE_URL of semdb init",
+        "writer": "SEMDB_DATABASE_URL",
+        "reader": "SEMDB_READER_URL",
+    }
+    for role, account_url in plan.urls.items():
+        print(f"{'' if execute else '-- '}{role} ({variables[role]}): {account_url}")
 
 
 def _init(url: str) -> None:

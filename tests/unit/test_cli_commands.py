@@ -259,3 +259,47 @@ def test_dropped_frames_are_grouped_by_reason() -> None:
         "5 x rgb/0.png: no depth within 20 ms (nearest 0 ms): rgb/0.png, rgb/1.png, rgb/2.png and 2 more",
         "1 x pose is not a number: rgb/9.png",
     ]
+
+
+@pytest.mark.usefixtures("keyframes")
+def test_sql_in_three_formats() -> None:
+    query = "SELECT recording, COUNT(*) AS n FROM keyframe_objects GROUP BY recording ORDER BY recording"
+    rows = json.loads(run("sql", query, "--format", "json").stdout)
+    assert [row["recording"] for row in rows] == ["first visit", "second visit"]
+    assert all(row["n"] > 0 for row in rows)
+    lines = run("sql", query, "--format", "csv").stdout.splitlines()
+    assert lines == ["recording,n", *(f"{row['recording']},{row['n']}" for row in rows)]
+    assert run("sql", query).stdout.splitlines()[2].split() == ["first", "visit", str(rows[0]["n"])]
+
+
+@pytest.mark.usefixtures("keyframes")
+def test_sql_only_reads() -> None:
+    assert run("sql", "DELETE FROM keyframes", code=2).stderr.startswith("semdb: only queries can be run here")
+    assert "refused" in run("sql", "WITH one AS (SELECT 1) DELETE FROM keyframes", code=1).stderr
+    assert "no such column" in run("sql", "SELECT nothing FROM keyframes", code=1).stderr
+    assert run("sql", "SELECT 1", "--format", "xml", code=2).exit_code == 2
+    assert stored() == {"first visit": 5, "second visit": 2}
+
+
+def test_sql_on_a_server_needs_a_reader() -> None:
+    result = run("sql", "SELECT 1", "--database-url", "mysql+pymysql://ann:secret@127.0.0.1:9/semdb", code=2)
+    assert "SEMDB_READER_URL" in result.stderr
+
+
+def test_accounts_are_printed_as_sql() -> None:
+    output = run("init", "--accounts", "--database-url", "mysql+pymysql://root:top@127.0.0.1:9/maps").stdout
+    statements = [line for line in output.splitlines() if not line.startswith("-- ")]
+    assert statements[0].startswith("CREATE DATABASE IF NOT EXISTS `maps`")
+    assert [line.split("'")[1] for line in statements if line.startswith("CREATE USER")] == [
+        "semdb_owner",
+        "semdb_writer",
+        "semdb_reader",
+    ]
+    assert "GRANT SELECT, SHOW VIEW ON `maps`.* TO 'semdb_reader'@'%';" in statements
+    urls = {line.split()[1]: line.split()[-1] for line in output.splitlines() if line.startswith("-- ")}
+    assert set(urls) == {"owner", "writer", "reader"}
+    assert urls["reader"].startswith("mysql+pymysql://semdb_reader:")
+    assert "top" not in output
+
+    assert "SQLite has no accounts" in run("init", "--accounts", code=2).stderr
+    assert "--execute goes with --accounts" in run("init", "--execute", code=2).stderr
