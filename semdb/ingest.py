@@ -106,12 +106,17 @@ def ingest_recording(
     options: IngestOptions,
     *,
     progress: Progress | None = None,
+    entries: Sequence[FrameEntry] | None = None,
 ) -> IngestSummary:
-    """Ingests one open recording. Frames that cannot be read are `failed` with their reason; the rest goes on."""
+    """Ingests one open recording. Frames that cannot be read are `failed` with their reason; the rest goes on.
+
+    `entries` are the keyframes where the caller has selected them.
+    """
     map_name = options.map_name or default_map_name(recording)
     check_models(map_models_of(store, map_name), describer.models, f"the map {map_name!r}")
     started = time.perf_counter()
-    entries = _planned_entries(recording, store, map_name, options, progress)
+    if entries is None:
+        entries = _planned_entries(recording, store, map_name, options, progress)
     selected = time.perf_counter()
     plan = _plan(recording, store, map_name, describer, entries)
     summary = IngestSummary(

@@ -51,7 +51,7 @@ def specs_for_ingest(settings: Settings, map_models: Sequence[ModelInfo], *, has
             "this recording brings no object masks, so a detector is needed: set SEMDB_DETECTOR=onnx:FILE "
             "(a Mask R-CNN as ONNX, see docs/models.md) or pass --detector"
         )
-    return ModelSpecs(**chosen, notes=tuple(notes))
+    return ModelSpecs(chosen["detector"], chosen["encoder"], chosen["features"], tuple(notes))
 
 
 def specs_for_query(settings: Settings, map_models: Sequence[ModelInfo]) -> ModelSpecs:
@@ -68,7 +68,7 @@ def specs_for_query(settings: Settings, map_models: Sequence[ModelInfo]) -> Mode
         raise UsageError(
             "the map holds no keyframe yet, so it cannot say which models to use: ingest a recording first"
         )
-    return ModelSpecs(**chosen)
+    return ModelSpecs(chosen["detector"], chosen["encoder"], chosen["features"])
 
 
 def _spec_of(model: ModelInfo, settings: Settings) -> str:

@@ -73,3 +73,37 @@ def _rich_bar(stream: TextIO) -> Any:
         console=Console(file=stream),
         transient=True,
     )
+
+
+class StagedProgress:
+    """Progress of work in several stages: a bar for each stage that is named, one after the other."""
+
+    def __init__(self) -> None:
+        self._label = ""
+        self._current: Progress | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._end()
+
+    def _end(self) -> None:
+        if self._current is not None:
+            self._current.__exit__(None, None, None)
+            self._current = None
+
+    def update(self, label: str, done: int, total: int) -> None:
+        """Say that `done` of `total` of the stage `label` are finished."""
+        if label != self._label or self._current is None:
+            self._end()
+            self._label = label
+            self._current = Progress(label).__enter__()
+        self._current.update(done, total)
+
+
+def say(line: str) -> None:
+    """A line for people, on stderr."""
+    print(f"semdb: {line}", file=sys.stderr, flush=True)
