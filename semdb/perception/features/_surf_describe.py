@@ -2,6 +2,8 @@
 
 Source: Bay, Ess, Tuytelaars, Van Gool, Speeded-Up Robust Features (CVIU 2008); sample positions, weights and the
 search of the orientation (windows of 60 degrees every 5) are those of OpenCV's implementation.
+
+Arrays are flat and offsets unsigned where time is spent: slices would count references, signed indices would be tested.
 """
 
 from __future__ import annotations
@@ -14,125 +16,244 @@ import numpy as np
 from semdb.perception.features._jit import kernel
 
 GRID = 20  # gradients across the descriptor window, each of size s
-CELLS = GRID + 1
-ORIENTATION_RADIUS = 6
-ORIENTATION_SIGMA = 2.5
-DESCRIPTOR_SIGMA = 3.3
+CELLS = GRID + 1  # means of grey across it
+RADIUS = 6  # of the disc for the orientation, in units of s
+ACROSS = 2 * RADIUS + 1
+SECTORS = 72
 DEGREES = 180.0 / math.pi
 
 
 def gaussian(n: int, sigma: float) -> Any:
-    """float32 [n], normalised, centred."""
+    """float32 [n, n], product of two normalised Gaussians, centred."""
     x = np.arange(n) - (n - 1) / 2
     weights = np.exp(-(x * x) / (2 * sigma * sigma))
-    return (weights / weights.sum()).astype(np.float32)
+    weights /= weights.sum()
+    return np.outer(weights, weights).astype(np.float32)
+
+
+def orientation_weights() -> Any:
+    """float32 [169]: weights of the gradients around a keypoint, 0 off the disc."""
+    i = np.arange(-RADIUS, RADIUS + 1)
+    disc = i[:, None] ** 2 + i**2 <= RADIUS**2
+    return np.where(disc, gaussian(ACROSS, 2.5), np.float32(0)).ravel()
+
+
+def descriptor_weights() -> Any:
+    """float32 [400]: weights of the gradients of a descriptor."""
+    return gaussian(GRID, 3.3).ravel()
 
 
 @kernel
-def _orientation(sums: Any, pad: int, height: int, width: int, x: float, y: float, s: float, weights: Any) -> float:
-    """Dominant direction of the gradient around (x, y) in degrees, -1 where no gradient can be measured.
+def _gradients(sums: Any, pitch: int, pad: int, height: int, width: int, x: float, y: float, s: float,
+               weights: Any, columns: Any, gx: Any, gy: Any) -> int:  # fmt: skip
+    """Weighted Haar responses of size 4s on the 13x13 lattice of spacing s around (x, y), into `gx`, `gy` [169].
 
-    Haar responses of size 4s on a disc of radius 6s; the sector of 60 degrees with the longest sum wins. Angles are
-    binned so that a sector is a run of bins (even: a multiple of 5 degrees, odd: those between two) and one
-    pass of running sums tries all 72.
+    Returns how many of them on the disc lie fully in the image; the others are 0.
     """
     size = 2 * int(np.rint(2 * s))
     if size > height or size > width:
-        return -1.0
+        return 0
     half = size // 2
-    bins = np.zeros((2, 144), np.float64)
     found = 0
-    for i in range(-ORIENTATION_RADIUS, ORIENTATION_RADIUS + 1):
-        top = int(np.rint(y + i * s - (size - 1) * 0.5))
-        if top < 0 or top > height - size:
-            continue
-        a, b, c = sums[top + pad], sums[top + half + pad], sums[top + size + pad]
-        for j in range(-ORIENTATION_RADIUS, ORIENTATION_RADIUS + 1):
-            if i * i + j * j > ORIENTATION_RADIUS * ORIENTATION_RADIUS:
+    for j in range(ACROSS):
+        left = int(np.rint(x + (j - RADIUS) * s - (size - 1) * 0.5))
+        columns[j] = left + pad if 0 <= left <= width - size else -1
+    for i in range(ACROSS):
+        top = int(np.rint(y + (i - RADIUS) * s - (size - 1) * 0.5))
+        inside = 0 <= top <= height - size
+        a = (top + pad) * pitch
+        b = a + half * pitch
+        c = a + size * pitch
+        for j in range(ACROSS):
+            k = i * ACROSS + j
+            weight = weights[k]
+            left = columns[j]
+            if weight == 0 or left < 0 or not inside:
+                gx[k] = 0
+                gy[k] = 0
                 continue
-            left = int(np.rint(x + j * s - (size - 1) * 0.5))
-            if left < 0 or left > width - size:
-                continue
-            p, q, r = left + pad, left + half + pad, left + size + pad
+            ap, bp, cp = np.uintp(a + left), np.uintp(b + left), np.uintp(c + left)
+            q, r = np.uintp(half), np.uintp(size)
             # differences along columns first: they fit although the sums may have wrapped
-            whole_p, whole_q, whole_r = np.int32(c[p] - a[p]), np.int32(c[q] - a[q]), np.int32(c[r] - a[r])
-            upper = np.int32(b[r] - a[r]) - np.int32(b[p] - a[p])
-            dx = whole_r - 2 * whole_q + whole_p
-            dy = (whole_r - whole_p) - 2 * upper
-            weight = weights[i + ORIENTATION_RADIUS] * weights[j + ORIENTATION_RADIUS]
-            gx, gy = dx * weight, dy * weight
-            angle = int(np.rint(math.atan2(gy, gx) * DEGREES)) % 360
-            k = 2 * (angle // 5) + (1 if angle % 5 else 0)
-            bins[0, k] += gx
-            bins[1, k] += gy
+            whole_p = np.int32(sums[cp] - sums[ap])
+            whole_q = np.int32(sums[cp + q] - sums[ap + q])
+            whole_r = np.int32(sums[cp + r] - sums[ap + r])
+            upper = np.int32(np.int32(sums[bp + r] - sums[ap + r]) - np.int32(sums[bp] - sums[ap]))
+            gx[k] = np.float32(whole_r - 2 * whole_q + whole_p) * weight
+            gy[k] = np.float32(whole_r - whole_p - 2 * upper) * weight
             found += 1
-    if found == 0:
-        return -1.0
+    return found
+
+
+@kernel
+def _sector_bins(gx: Any, gy: Any, bins: Any) -> None:
+    """bins[k]: 2 (a // 5), and one more unless a % 5 == 0, for the direction of a gradient in whole degrees a.
+
+    Arctangent: Abramowitz and Stegun 4.4.49, error 1e-5 rad.
+    """
+    for k in range(ACROSS * ACROSS):
+        x, y = gx[k], gy[k]
+        ax, ay = abs(x), abs(y)
+        t = min(ax, ay) / (max(ax, ay) + np.float32(1e-20))
+        t2 = t * t
+        r = np.float32(0.0208351) * t2 - np.float32(0.0851330)
+        r = r * t2 + np.float32(0.1801410)
+        r = r * t2 - np.float32(0.3302995)
+        r = (r * t2 + np.float32(0.9998660)) * t * np.float32(DEGREES)
+        r = np.float32(90) - r if ay > ax else r
+        r = np.float32(180) - r if x < 0 else r
+        r = np.float32(360) - r if y < 0 else r
+        angle = np.int32(np.rint(r))
+        angle = np.int32(0) if angle == 360 else angle
+        fives = np.int32(np.float32(angle) * np.float32(0.2) + np.float32(0.05))
+        bins[k] = np.int32(2) * fives + np.int32(angle != np.int32(5) * fives)
+
+
+@kernel
+def _dominant_angle(gx: Any, gy: Any, bins: Any, sums: Any) -> float:
+    """Direction, in degrees, of the longest sum of gradients over a sector of 60 degrees, tried every 5 degrees.
+
+    A sector is a run of 23 bins: running sums try all. `sums` float64 [2 * (144 + 23)] is scratch.
+    """
+    n = 2 * SECTORS
+    for k in range(n):
+        sums[k] = 0
+        sums[n + 23 + k] = 0
+    for k in range(ACROSS * ACROSS):
+        p = np.uintp(bins[k])
+        sums[p] += gx[k]
+        sums[p + np.uintp(n + 23)] += gy[k]
+    for k in range(23):
+        sums[n + k] = sums[k]
+        sums[n + 23 + n + k] = sums[n + 23 + k]
+    x = y = 0.0
+    for k in range(1, 24):  # the sector around bin 12
+        x += sums[k]
+        y += sums[n + 23 + k]
     best = -1.0
     best_x = best_y = 0.0
-    for sector in range(72):
-        sum_x = sum_y = 0.0
-        for k in range(2 * sector - 11, 2 * sector + 12):
-            sum_x += bins[0, k % 144]
-            sum_y += bins[1, k % 144]
-        length = sum_x * sum_x + sum_y * sum_y
+    for k in range(1, n, 2):
+        length = x * x + y * y
         if length > best:
-            best, best_x, best_y = length, sum_x, sum_y
+            best, best_x, best_y = length, x, y
+        if k + 24 < n + 23:
+            x += (sums[k + 23] - sums[k]) + (sums[k + 24] - sums[k + 1])
+            y += (sums[n + 46 + k] - sums[n + 23 + k]) + (sums[n + 47 + k] - sums[n + 24 + k])
     return (math.atan2(best_y, best_x) * DEGREES) % 360.0
 
 
 @kernel
-def _strip(a: Any, b: Any, c: Any, d: Any, x: int, fy0: float, fy1: float) -> float:
-    """Sum left of column `x` between the top, `fy0` of the way from row a to b, and the bottom, from c to d."""
-    return np.int32(c[x] - a[x]) + fy1 * np.int32(d[x] - c[x]) - fy0 * np.int32(b[x] - a[x])
+def orient(sums: Any, pitch: int, pad: int, height: int, width: int, candidates: Any, weights: Any,
+           start: int, stop: int, angles: Any) -> None:  # fmt: skip
+    """angles[start:stop]: dominant direction of the gradient around each candidate, -1 where it cannot be measured.
+
+    `sums` int32 flat: the padded integral image with `pitch` columns.
+    """
+    columns = np.empty(ACROSS, np.int64)
+    gx = np.empty(ACROSS * ACROSS, np.float32)
+    gy = np.empty(ACROSS * ACROSS, np.float32)
+    bins = np.empty(ACROSS * ACROSS, np.int32)
+    scratch = np.empty(2 * (2 * SECTORS + 23), np.float64)
+    for k in range(start, stop):
+        x, y, s = candidates[k, 0], candidates[k, 1], candidates[k, 2] * 1.2 / 9.0
+        if _gradients(sums, pitch, pad, height, width, x, y, s, weights, columns, gx, gy) == 0:
+            angles[k] = -1
+            continue
+        _sector_bins(gx, gy, bins)
+        angles[k] = _dominant_angle(gx, gy, bins, scratch)
 
 
 @kernel
-def _cell_means(sums: Any, pad: int, x: float, y: float, side: float, sine: float, cosine: float, out: Any) -> None:
-    """out[i, j]: mean grey value of the box of side `side` around cell (i, j) of the turned grid centred at (x, y)."""
-    rows, columns = sums.shape
-    for i in range(CELLS):
-        for j in range(CELLS):
-            u, v = (j - GRID // 2) * side, (i - GRID // 2) * side
-            left = x + cosine * u - sine * v + (pad + 0.5 - side / 2)
-            top = y + sine * u + cosine * v + (pad + 0.5 - side / 2)
-            left = min(max(left, 0.0), columns - 1 - side - 1e-3)
-            top = min(max(top, 0.0), rows - 1 - side - 1e-3)
-            right, bottom = left + side, top + side
-            x0, x1, y0, y1 = int(left), int(right), int(top), int(bottom)
-            fx0, fx1, fy0, fy1 = left - x0, right - x1, top - y0, bottom - y1
-            a, b, c, d = sums[y0], sums[y0 + 1], sums[y1], sums[y1 + 1]
-            p0 = _strip(a, b, c, d, x0, fy0, fy1)
-            p1 = _strip(a, b, c, d, x0 + 1, fy0, fy1)
-            q0 = _strip(a, b, c, d, x1, fy0, fy1)
-            q1 = _strip(a, b, c, d, x1 + 1, fy0, fy1)
-            out[i, j] = (q0 + fx1 * (q1 - q0) - p0 - fx0 * (p1 - p0)) / (side * side)
+def smooth(sums: Any, pitch: int, pad: int, step: int, half: int, edge: float, margin: int, first: int,
+           rows: int, columns: int, out: Any) -> None:  # fmt: skip
+    """Grey means around every `step`-th pixel: a box of 2 half + 1 pixels and a rim of one more with weight `edge`.
+
+    out[k * columns + l], k < rows, is the mean around the pixel ((first + k) * step - margin, l * step - margin).
+    """
+    taps = 2 * half + 1 + 2 * edge
+    scale = 1.0 / (taps * taps)
+    w00 = np.float32((1 - edge) * (1 - edge) * scale)
+    w01 = np.float32((1 - edge) * edge * scale)
+    w11 = np.float32(edge * edge * scale)
+    inner = np.empty(pitch, np.int32)
+    wide = np.empty(pitch, np.int32)
+    left = pad - margin - half
+    i0, i1 = np.uintp(left), np.uintp(left + 2 * half + 1)
+    r0, r1 = np.uintp(left - 1), np.uintp(left + 2 * half + 2)
+    for k in range(rows):
+        y = pad + (first + k) * step - margin - half
+        a, b = np.uintp(y * pitch), np.uintp((y + 2 * half + 1) * pitch)
+        c, d = np.uintp((y - 1) * pitch), np.uintp((y + 2 * half + 2) * pitch)
+        for i in range(pitch):
+            x = np.uintp(i)
+            inner[x] = np.int32(sums[b + x] - sums[a + x])
+            wide[x] = np.int32(sums[d + x] - sums[c + x])
+        target = np.uintp(k * columns)
+        for i in range(columns):
+            x = np.uintp(i) * np.uintp(step)
+            box = np.float32(np.int32(inner[i1 + x] - inner[i0 + x])) * w00
+            box += np.float32(np.int32(inner[r1 + x] - inner[r0 + x])) * w01
+            box += np.float32(np.int32(wide[i1 + x] - wide[i0 + x])) * w01
+            box += np.float32(np.int32(wide[r1 + x] - wide[r0 + x])) * w11
+            out[target + np.uintp(i)] = box
 
 
 @kernel
-def _collect(means: Any, weights: Any, extended: bool, out: Any) -> None:
+def _sample(grey: Any, first: int, rows: int, columns: int, x: Any, y: Any, dx: Any, dy: Any, means: Any) -> None:
+    """means[i * 21 + j]: the smooth image, bilinear, at cell (i, j) of the turned grid centred at (x, y).
+
+    One cell to the right is (dx, dy), one down is (-dy, dx), in its samples. `grey` holds its rows from `first` on; it
+    has `rows` in all, and positions beyond its border are moved to the border.
+    """
+    right, bottom = np.float32(columns - 1.01), np.float32(rows - 1.01)
+    low = np.uintp(columns)
+    one = np.uintp(1)
+    k = 0
+    for i in range(-(GRID // 2), GRID // 2 + 1):
+        u, v = x - i * dy, y + i * dx
+        for j in range(-(GRID // 2), GRID // 2 + 1):
+            p = min(max(u + j * dx, np.float32(0)), right)
+            q = min(max(v + j * dy, np.float32(0)), bottom)
+            ip, iq = np.int32(p), np.int32(q)
+            fp, fq = p - np.float32(ip), q - np.float32(iq)
+            at = np.uintp((iq - first) * columns + ip)
+            top = grey[at] + fp * (grey[at + one] - grey[at])
+            below = grey[at + low] + fp * (grey[at + low + one] - grey[at + low])
+            means[k] = top + fq * (below - top)
+            k += 1
+
+
+@kernel
+def _collect(means: Any, weights: Any, extended: bool, gx: Any, gy: Any, out: Any) -> None:
     """Sums of the weighted gradients in 4x4 fields of 5x5, as a unit vector."""
-    out[:] = 0
-    width = 8 if extended else 4
     for i in range(GRID):
         for j in range(GRID):
-            weight = weights[i] * weights[j]
-            a, b, c, d = means[i, j], means[i, j + 1], means[i + 1, j], means[i + 1, j + 1]
-            dx = (b - a + d - c) * weight
-            dy = (c - a + d - b) * weight
-            k = (i // 5 * 4 + j // 5) * width
-            if not extended:
-                out[k] += dx
-                out[k + 1] += dy
-                out[k + 2] += abs(dx)
-                out[k + 3] += abs(dy)
-            else:
-                p = k if dy >= 0 else k + 2
-                out[p] += dx
-                out[p + 1] += abs(dx)
-                q = k + 4 if dx >= 0 else k + 6
-                out[q] += dy
-                out[q + 1] += abs(dy)
+            k = np.uintp(i * CELLS + j)
+            a, b = means[k], means[k + np.uintp(1)]
+            c, d = means[k + np.uintp(CELLS)], means[k + np.uintp(CELLS + 1)]
+            w = weights[i * GRID + j]
+            gx[i * GRID + j] = ((b - a) + (d - c)) * w
+            gy[i * GRID + j] = ((c - a) + (d - b)) * w
+    width = 8 if extended else 4
+    for k in range(len(out)):
+        out[k] = 0
+    for i in range(GRID):
+        for field in range(4):
+            k = (i // 5 * 4 + field) * width
+            for j in range(i * GRID + field * 5, i * GRID + field * 5 + 5):
+                dx, dy = gx[j], gy[j]
+                if not extended:
+                    out[k] += dx
+                    out[k + 1] += dy
+                    out[k + 2] += abs(dx)
+                    out[k + 3] += abs(dy)
+                else:
+                    p = k if dy >= 0 else k + 2
+                    out[p] += dx
+                    out[p + 1] += abs(dx)
+                    q = k + 4 if dx >= 0 else k + 6
+                    out[q] += dy
+                    out[q + 1] += abs(dy)
     norm = np.float32(0)
     for k in range(len(out)):
         norm += out[k] * out[k]
@@ -142,33 +263,20 @@ def _collect(means: Any, weights: Any, extended: bool, out: Any) -> None:
 
 
 @kernel
-def describe(
-    sums: Any,
-    pad: int,
-    height: int,
-    width: int,
-    candidates: Any,
-    upright: bool,
-    extended: bool,
-    orientation_weights: Any,
-    descriptor_weights: Any,
-    start: int,
-    stop: int,
-    angles: Any,
-    descriptors: Any,
-) -> None:
-    """Angle (degrees, -1: not measurable) and descriptor of the candidates `start` to `stop`.
+def describe(grey: Any, step: int, margin: int, first: int, rows: int, columns: int, candidates: Any, angles: Any,
+             chosen: Any, extended: bool, weights: Any, descriptors: Any) -> None:  # fmt: skip
+    """Descriptors of the candidates `chosen`, from the rows from `first` on of an image that `smooth` made.
 
-    A `descriptors` array of no rows leaves the descriptors out.
+    `rows` is how many rows the image would have in all.
     """
-    means = np.empty((CELLS, CELLS), np.float32)
-    for k in range(start, stop):
-        x, y, size = candidates[k, 0], candidates[k, 1], candidates[k, 2]
-        s = size * 1.2 / 9.0
-        angle = 270.0 if upright else _orientation(sums, pad, height, width, x, y, s, orientation_weights)
-        angles[k] = angle
-        if angle < 0 or len(descriptors) == 0:
-            continue
-        side = math.floor(CELLS * s) / CELLS
-        _cell_means(sums, pad, x, y, side, math.sin(angle / DEGREES), math.cos(angle / DEGREES), means)
-        _collect(means, descriptor_weights, extended, descriptors[k])
+    means = np.empty(CELLS * CELLS, np.float32)
+    gx = np.empty(GRID * GRID, np.float32)
+    gy = np.empty(GRID * GRID, np.float32)
+    for k in chosen:
+        side = math.floor(CELLS * candidates[k, 2] * 1.2 / 9.0) / CELLS / step
+        angle = angles[k] / DEGREES
+        x = np.float32((candidates[k, 0] + margin) / step)
+        y = np.float32((candidates[k, 1] + margin) / step)
+        dx, dy = np.float32(math.cos(angle) * side), np.float32(math.sin(angle) * side)
+        _sample(grey, first, rows, columns, x, y, dx, dy, means)
+        _collect(means, weights, extended, gx, gy, descriptors[k])

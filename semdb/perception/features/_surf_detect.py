@@ -39,10 +39,12 @@ def integral(image: Any, out: Any) -> None:
 
 
 @kernel
-def deinterleave(sums: Any, out: Any) -> None:
-    """`out` [rows, step, columns]: every `step`-th column of `sums` [rows, W] side by side, for contiguous reads."""
-    rows, step, columns = out.shape
-    for y in range(rows):
+def deinterleave(sums: Any, first: int, last: int, out: Any) -> None:
+    """`out` [rows, step, columns]: every `step`-th column of `sums` [rows, W] side by side, for contiguous reads;
+    rows `first` to `last` only.
+    """
+    _, step, columns = out.shape
+    for y in range(first, last):
         source = sums[y]
         for phase in range(step):
             target = out[y, phase]
@@ -51,68 +53,84 @@ def deinterleave(sums: Any, out: Any) -> None:
 
 
 @kernel
-def _boxes(sums: Any, top: int, bottom: int, column: int, left: int, right: int, out: Any) -> None:
-    """out[x] = sum over rows `top` to `bottom` and columns `left` to `right` right of sample column `column` + x."""
-    n = len(out)
-    step = sums.shape[1]
-    p = column + left // step
-    q = column + right // step
-    a = sums[top, left % step, p : p + n]
-    b = sums[bottom, left % step, p : p + n]
-    c = sums[top, right % step, q : q + n]
-    d = sums[bottom, right % step, q : q + n]
-    for x in range(n):
-        out[x] = np.int32(np.int32(d[x] - c[x]) - np.int32(b[x] - a[x]))
+def _box_row(flat: Any, a: int, b: int, c: int, d: int, out: Any, at: int, n: int) -> None:
+    """out[at + x] = (flat[d + x] - flat[c + x]) - (flat[b + x] - flat[a + x]): box sums from their four corners.
 
-
-@kernel
-def _combine(boxes: Any, weight: Any, weight_xy: Any, out: Any) -> None:
-    """out[x] = Dxx Dyy - 0.81 Dxy^2, from the whole and middle boxes of Dxx and Dyy and the four of Dxy."""
-    n = len(out)
-    xx, mid_xx, yy, mid_yy = boxes[0, :n], boxes[1, :n], boxes[2, :n], boxes[3, :n]
-    a, b, c, d = boxes[4, :n], boxes[5, :n], boxes[6, :n], boxes[7, :n]
-    for x in range(n):
-        dxx = np.float32(np.int32(xx[x] - np.int32(3) * mid_xx[x])) * weight
-        dyy = np.float32(np.int32(yy[x] - np.int32(3) * mid_yy[x])) * weight
-        dxy = np.float32(np.int32(np.int32(a[x] - b[x]) - np.int32(c[x] - d[x]))) * weight_xy
-        out[x] = dxx * dyy - DXY_WEIGHT * (dxy * dxy)
-
-
-@kernel
-def _filter_boxes(sums: Any, pad: int, size: int, i: int, start: int, boxes: Any) -> Any:
-    """The eight box sums of filter `size` at sample row `i`, sample columns from `start` on, into `boxes` [8, n].
-
-    Returns the weights of the second derivatives (one over the area of a lobe) and of the mixed one.
+    Flat arrays and unsigned offsets: slices would count references, signed indices would be tested for their sign.
     """
-    step = sums.shape[1]
+    ua, ub, uc, ud, target = np.uintp(a), np.uintp(b), np.uintp(c), np.uintp(d), np.uintp(at)
+    for i in range(n):
+        x = np.uintp(i)
+        right = np.int32(flat[ud + x] - flat[uc + x])
+        left = np.int32(flat[ub + x] - flat[ua + x])
+        out[target + x] = np.int32(right - left)
+
+
+@kernel
+def _combine(boxes: Any, n: int, weight: Any, weight_xy: Any, out: Any, at: int) -> None:
+    """out[at + x] = Dxx Dyy - 0.81 Dxy^2, from the whole and middle boxes of Dxx and Dyy and the four of Dxy."""
+    target = np.uintp(at)
+    pitch = len(boxes) // 8
+    o1, o2, o3, o4 = np.uintp(pitch), np.uintp(2 * pitch), np.uintp(3 * pitch), np.uintp(4 * pitch)
+    o5, o6, o7 = np.uintp(5 * pitch), np.uintp(6 * pitch), np.uintp(7 * pitch)
+    for i in range(n):
+        x = np.uintp(i)
+        dxx = np.float32(np.int32(boxes[x] - np.int32(3) * boxes[o1 + x])) * weight
+        dyy = np.float32(np.int32(boxes[o2 + x] - np.int32(3) * boxes[o3 + x])) * weight
+        first = np.int32(boxes[o4 + x] - boxes[o5 + x])
+        second = np.int32(boxes[o6 + x] - boxes[o7 + x])
+        dxy = np.float32(np.int32(first - second)) * weight_xy
+        out[target + x] = dxx * dyy - DXY_WEIGHT * (dxy * dxy)
+
+
+@kernel
+def _filter_boxes(
+    flat: Any, step: int, columns: int, pad: int, size: int, i: int, start: int, n: int, boxes: Any
+) -> Any:
+    """The eight box sums of filter `size` at sample row `i`, `n` sample columns from `start` on, into `boxes` [8 * m].
+
+    `flat` is the de-interleaved integral image [rows, step, columns]. Returns the weights of the second derivatives
+    (one over the area of a lobe) and of the mixed one.
+    """
+    pitch = len(boxes) // 8
     margin = (size // 2) // step
-    y = step * (i - margin) + pad
-    x = start - margin + pad // step
     third = size // 3
     # corners of the lobes: ninths of the size, rounded
     a, e, b = (2 * size + 9) // 18, (4 * size + 9) // 18, (8 * size + 9) // 18
     c, f, d = (10 * size + 9) // 18, (14 * size + 9) // 18, (16 * size + 9) // 18
-    _boxes(sums, y + e, y + f, x, 0, size, boxes[0])
-    _boxes(sums, y + e, y + f, x, third, 2 * third, boxes[1])
-    _boxes(sums, y, y + size, x, e, f, boxes[2])
-    _boxes(sums, y + third, y + 2 * third, x, e, f, boxes[3])
-    _boxes(sums, y + a, y + b, x, a, b, boxes[4])
-    _boxes(sums, y + a, y + b, x, c, d, boxes[5])
-    _boxes(sums, y + c, y + d, x, a, b, boxes[6])
-    _boxes(sums, y + c, y + d, x, c, d, boxes[7])
+    row = step * columns
+    origin = (step * (i - margin) + pad) * row + start - margin + pad // step
+    corners = (
+        (e, f, 0, size),
+        (e, f, third, 2 * third),
+        (0, size, e, f),
+        (third, 2 * third, e, f),
+        (a, b, a, b),
+        (a, b, c, d),
+        (c, d, a, b),
+        (c, d, c, d),
+    )
+    for k, (top, bottom, left, right) in enumerate(corners):
+        p = origin + left % step * columns + left // step
+        q = origin + right % step * columns + right // step
+        _box_row(flat, p + top * row, p + bottom * row, q + top * row, q + bottom * row, boxes, k * pitch, n)
     return np.float32(1.0 / (third * (f - e))), np.float32(1.0 / ((b - a) * (b - a)))
 
 
 @kernel
-def _candidate_flags(here: Any, above: Any, below: Any, smaller: Any, larger: Any, threshold: Any, flags: Any) -> None:
-    """flags[x] says whether here[x + 1] passes the threshold and its nearest six neighbours (arrays of n + 2)."""
-    n = len(here) - 2
-    left, middle, right = here[:n], here[1 : n + 1], here[2 : n + 2]
-    up, down, inner, outer = above[1 : n + 1], below[1 : n + 1], smaller[1 : n + 1], larger[1 : n + 1]
-    for x in range(n):
-        v = middle[x]
-        best = max(left[x], right[x], up[x], down[x], inner[x], outer[x], threshold)
-        flags[x] = v > best
+def _candidate_flags(
+    ring: Any, here: int, above: int, below: int, smaller: int, larger: int, n: int, threshold: Any, flags: Any
+) -> None:
+    """flags[x] says whether ring[here + x] passes the threshold and its nearest six neighbours (offsets of rows)."""
+    o, u, d, s, e = np.uintp(here), np.uintp(above), np.uintp(below), np.uintp(smaller), np.uintp(larger)
+    left, right = np.uintp(here - 1), np.uintp(here + 1)
+    for i in range(n):
+        x = np.uintp(i)
+        v = ring[o + x]
+        flags[x] = (
+            (v > threshold) & (v > ring[left + x]) & (v > ring[right + x]) & (v > ring[u + x])
+            & (v > ring[d + x]) & (v > ring[s + x]) & (v > ring[e + x])
+        )  # fmt: skip
 
 
 @kernel
@@ -174,9 +192,12 @@ def find_maxima(
     with more room then.
     """
     step = sums.shape[1]
+    flat = sums.reshape(sums.size)
     rows, columns = height // step, width // step
-    ring = np.empty((layers + 2, 3, columns + 2), np.float32)  # determinants of three rows
-    boxes = np.empty((8, columns), np.int32)
+    pitch = columns + 2
+    ring = np.empty((layers + 2, 3, pitch), np.float32)  # determinants of three rows
+    ring_flat = ring.reshape(ring.size)
+    boxes = np.empty(8 * columns, np.int32)
     flags = np.zeros(columns + 16, np.uint8)
     words = flags[: (columns + 15) // 8 * 8].view(np.uint64)
     count = 0
@@ -188,10 +209,10 @@ def find_maxima(
                 continue
             for k in range(len(spans)):
                 start = max(spans[k, 0] - 1, margin)
-                stop = min(spans[k, 1] + 1, margin + 1 + (width - size) // step)
-                if start < stop:
-                    weight, weight_xy = _filter_boxes(sums, pad, size, i, start, boxes[:, : stop - start])
-                    _combine(boxes, weight, weight_xy, ring[layer, i % 3, start:stop])
+                n = min(spans[k, 1] + 1, margin + 1 + (width - size) // step) - start
+                if n > 0:
+                    weight, weight_xy = _filter_boxes(flat, step, sums.shape[2], pad, size, i, start, n, boxes)
+                    _combine(boxes, n, weight, weight_xy, ring_flat, (layer * 3 + i % 3) * pitch + start)
         if i <= first:
             continue
         up, mid, down = (i - 2) % 3, (i - 1) % 3, i % 3
@@ -199,23 +220,17 @@ def find_maxima(
             margin = (((9 + 6 * (layer + 1)) << octave) // 2) // step + 1
             if i - 1 < margin or i - 1 >= rows - margin:
                 continue
-            size = (9 + 6 * layer) << octave
             for k in range(len(spans)):
                 start = max(spans[k, 0], margin)
                 n = min(spans[k, 1], columns - margin) - start
                 if n <= 0:
                     continue
-                window = slice(start - 1, start + n + 1)
-                here = ring[layer]
+                row = layer * 3 * pitch + start
+                here = row + mid * pitch
                 _candidate_flags(
-                    here[mid, window],
-                    here[up, window],
-                    here[down, window],
-                    ring[layer - 1, mid, window],
-                    ring[layer + 1, mid, window],
-                    threshold,
-                    flags,
-                )
+                    ring_flat, here, row + up * pitch, row + down * pitch, here - 3 * pitch, here + 3 * pitch,
+                    n, threshold, flags,
+                )  # fmt: skip
                 flags[n : n + 8] = 0
                 for w in range((n + 7) // 8):
                     if words[w] == 0:
@@ -228,10 +243,11 @@ def find_maxima(
                         if not within:
                             continue
                         if count < len(out):
+                            size = (9 + 6 * layer) << octave
                             half = (size // 2) // step
                             centre = (size - 1) * 0.5
-                            _filter_boxes(sums, pad, size, i - 1, j, boxes[:, :1])
-                            trace = boxes[0, 0] - 3 * boxes[1, 0] + boxes[2, 0] - 3 * boxes[3, 0]
+                            _filter_boxes(flat, step, sums.shape[2], pad, size, i - 1, j, 1, boxes)
+                            trace = boxes[0] - 3 * boxes[columns] + boxes[2 * columns] - 3 * boxes[3 * columns]
                             out[count, 0] = step * (j - half) + centre + dx * step
                             out[count, 1] = step * (i - 1 - half) + centre + dy * step
                             out[count, 2] = np.rint(size + ds * (6 << octave))

@@ -10,9 +10,12 @@ results are those of OpenCV's implementation (`docs/surf.md` compares them); the
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -21,10 +24,13 @@ import numpy as np
 import numpy.typing as npt
 
 from semdb.errors import UsageError
+from semdb.perception.features._surf_levels import CELL, level_keys, level_of
 from semdb.types import BoolArray, Features, Float32Array, ImageArray
 
+UPRIGHT_ANGLE = 270.0  # what OpenCV gives upright keypoints
 MASK_TILE = 16  # sample rows that share their columns to look at, when there is a mask
 MIN_CHUNK = 64  # keypoints that are worth a task of their own
+_NO_SUMS = np.zeros((1, 1), np.int32)
 
 
 class SURF:
@@ -66,9 +72,8 @@ class SURF:
         self.threads = int(threads)
         self._pool: ThreadPoolExecutor | None = None
         self._pool_lock = threading.Lock()
-        largest = (9 + 6 * (self.n_octave_layers + 1)) << (self.n_octaves - 1)
-        step = 1 << (self.n_octaves - 1)
-        self._pad = -(-(int(largest * 0.6 / 9) + 3) // step) * step  # room for the largest cell of a descriptor
+        self._scratch = _Scratch()
+        self._largest = (9 + 6 * (self.n_octave_layers + 1)) << (self.n_octaves - 1)
 
     def extract(self, image: ImageArray, mask: npt.NDArray[Any] | None = None) -> Features:
         """Keypoints and descriptors of a grey uint8 `image` [H, W], strongest first.
@@ -76,21 +81,18 @@ class SURF:
         With a `mask` [H, W], those whose centre lies on a pixel that is not zero: exactly the ones that the whole image
         has there, but only there is looked for them. Raises UsageError when image or mask are not of this kind.
         """
-        sums, candidates = self._detect(image, mask)
-        return self._describe(sums, candidates, image.shape, described=True)
+        return self._describe(*self._detect(image, mask), described=True)
 
     def detectAndCompute(  # noqa: N802
         self, image: ImageArray, mask: npt.NDArray[Any] | None = None
     ) -> tuple[tuple[cv2.KeyPoint, ...], Float32Array]:
         """Like `extract`: OpenCV keypoints (`class_id` holds the sign of the Laplacian) and float32 [n, 64 or 128]."""
-        sums, candidates = self._detect(image, mask)
-        features = self._describe(sums, candidates, image.shape, described=True)
+        features = self.extract(image, mask)
         return _keypoints(features), features.descriptors.astype(np.float32, copy=False)
 
     def detect(self, image: ImageArray, mask: npt.NDArray[Any] | None = None) -> tuple[cv2.KeyPoint, ...]:
         """The keypoints of `detectAndCompute`, without descriptors."""
-        sums, candidates = self._detect(image, mask)
-        return _keypoints(self._describe(sums, candidates, image.shape, described=False))
+        return _keypoints(self._describe(*self._detect(image, mask), described=False))
 
     def compute(
         self, image: ImageArray, keypoints: Sequence[cv2.KeyPoint]
@@ -101,7 +103,9 @@ class SURF:
         """
         rows = [(*k.pt, k.size, k.response, max(k.octave, 0), k.class_id) for k in keypoints]
         candidates = np.array(rows, dtype=np.float32).reshape(-1, 6)
-        features = self._describe(self._integral(_checked(image)), candidates, image.shape, described=True)
+        largest = max(self._largest, math.ceil(candidates[:, 2].max(initial=0)))
+        order = np.argsort(-candidates[:, 3], kind="stable")
+        features = self._describe(self._integral(_checked(image), largest), candidates, order, described=True)
         return _keypoints(features), features.descriptors.astype(np.float32, copy=False)
 
     def descriptorSize(self) -> int:  # noqa: N802
@@ -116,37 +120,34 @@ class SURF:
     def empty(self) -> bool:
         return False
 
-    def _integral(self, image: ImageArray) -> npt.NDArray[np.int32]:
+    def _integral(self, image: ImageArray, largest: int) -> _Plane:
         from semdb.perception.features._surf_detect import integral
 
-        pad = self._pad
-        padded = cv2.copyMakeBorder(image, pad, pad, pad, pad, cv2.BORDER_REPLICATE)
-        sums = np.empty((padded.shape[0] + 1, padded.shape[1] + 1), np.int32)
+        step = 1 << (self.n_octaves - 1)
+        pad = -(-level_of(int(level_keys(np.array([largest], np.float32))[0])).pad // step) * step
+        height, width = image.shape
+        padded = self._scratch.array("padded", (height + 2 * pad, width + 2 * pad), np.uint8)
+        cv2.copyMakeBorder(image, pad, pad, pad, pad, cv2.BORDER_REPLICATE, dst=padded)
+        sums = self._scratch.array("sums", (height + 2 * pad + 1, width + 2 * pad + 1), np.int32)
         integral(padded, sums)
-        return sums
+        return _Plane(sums, pad, height, width)
 
-    def _detect(self, image: ImageArray, mask: npt.NDArray[Any] | None) -> tuple[npt.NDArray[np.int32], Float32Array]:
-        """Padded integral image and candidates [n, 6], strongest first; ties in order of octave, row, layer, column."""
-        from semdb.perception.features._surf_detect import COLUMNS, deinterleave
+    def _detect(
+        self, image: ImageArray, mask: npt.NDArray[Any] | None
+    ) -> tuple[_Plane, Float32Array, npt.NDArray[np.intp]]:
+        """Candidates [n, 6] in order of octave, row, layer, column, and the order in which they are strongest first."""
+        from semdb.perception.features._surf_detect import COLUMNS
 
         image = _checked(image)
         height, width = image.shape
         region = None if mask is None else _checked_mask(mask, image.shape)
         if min(height, width) < 9 or (region is not None and not region.any()):
-            return np.zeros((1, 1), np.int32), np.zeros((0, COLUMNS), np.float32)
-        sums = self._integral(image)
+            return _Plane(_NO_SUMS, 0, height, width), np.zeros((0, COLUMNS), np.float32), np.zeros(0, np.intp)
+        plane = self._integral(image, self._largest)
         tasks: list[Callable[[], Float32Array]] = []
         for octave in range(self.n_octaves):
-            step = 1 << octave
-            if min(height, width) < (9 + 6 * 2) << octave:
-                break
-            if step == 1:
-                phases = sums[:, None, :]
-            else:
-                columns = (self._pad + width) // step + 1
-                phases = np.empty((sums.shape[0], step, columns), np.int32)
-                deinterleave(sums, phases)
-            tasks += self._octave_tasks(phases, image.shape, octave, region)
+            if min(height, width) >= (9 + 6 * 2) << octave:
+                tasks += self._octave_tasks(plane, octave, region)
         found = self._run(tasks)
         candidates = np.concatenate(found) if found else np.zeros((0, COLUMNS), np.float32)
         if region is not None:
@@ -154,72 +155,111 @@ class SURF:
             y = np.clip(np.floor(candidates[:, 1] + 0.5).astype(np.intp), 0, height - 1)
             candidates = candidates[region[y, x]]
         order = np.argsort(-candidates[:, 3], kind="stable")
-        return sums, candidates[order[: self.max_keypoints or None]]
+        if 0 < self.max_keypoints < len(candidates):
+            chosen = np.sort(order[: self.max_keypoints])
+            candidates = candidates[chosen]
+            order = np.argsort(-candidates[:, 3], kind="stable")
+        return plane, candidates, order
 
-    def _octave_tasks(
-        self, phases: npt.NDArray[np.int32], shape: tuple[int, int], octave: int, region: BoolArray | None
-    ) -> list[Callable[[], Float32Array]]:
-        from semdb.perception.features._surf_detect import COLUMNS, find_maxima
+    def _octave_tasks(self, plane: _Plane, octave: int, region: BoolArray | None) -> list[Callable[[], Float32Array]]:
+        from semdb.perception.features._surf_detect import COLUMNS, deinterleave, find_maxima
 
-        height, width = shape
         step = 1 << octave
-        rows, columns = height // step, width // step
+        rows, columns = plane.height // step, plane.width // step
+        phases = plane.sums[:, None, :]
+        if step > 1:
+            across = (plane.pad + plane.width) // step + 1
+            phases = self._scratch.array(f"octave {octave}", (plane.sums.shape[0], step, across), np.int32)
+            deinterleave(plane.sums, plane.pad, plane.pad + plane.height + 1, phases)
 
         def search(first: int, last: int, spans: npt.NDArray[np.int64]) -> Float32Array:
             capacity = 64 + (last - first) * columns // 64
             while True:
                 out = np.empty((capacity, COLUMNS), np.float32)
                 count = find_maxima(
-                    phases, self._pad, height, width, octave, self.n_octave_layers,
+                    phases, plane.pad, plane.height, plane.width, octave, self.n_octave_layers,
                     np.float32(self.hessian_threshold), first, last, spans, out,
                 )  # fmt: skip
                 if count <= capacity:
                     return out[:count]
                 capacity = count
 
-        if region is None:
-            everywhere = np.array([[0, columns]], np.int64)
-            bounds = np.linspace(0, rows, self.threads + 1).astype(int).tolist()
-            bands = [(a, b, everywhere) for a, b in pairwise(bounds) if a < b]
-        else:
-            bands = _mask_bands(region, step, rows, columns)
-        return [lambda a=a, b=b, s=s: search(a, b, s) for a, b, s in bands]  # type: ignore[misc]
+        if region is not None:
+            return [partial(search, *band) for band in _mask_bands(region, step, rows, columns)]
+        everywhere = np.array([[0, columns]], np.int64)
+        return [partial(search, a, b, everywhere) for a, b in _shares(rows, self.threads)]
 
     def _describe(
-        self, sums: npt.NDArray[np.int32], candidates: Float32Array, shape: tuple[int, ...], *, described: bool
+        self, plane: _Plane, candidates: Float32Array, order: npt.NDArray[np.intp], *, described: bool
     ) -> Features:
+        """Features of the candidates in the order given, without those whose orientation cannot be measured."""
         n = len(candidates)
-        angles = np.empty(n, np.float32)
+        angles = np.full(n, UPRIGHT_ANGLE, np.float32)
         descriptors = np.empty((n if described else 0, self.descriptorSize()), np.float32)
-        if n:
-            from semdb.perception.features import _surf_describe as kernels
-
-            weights = (
-                kernels.gaussian(2 * kernels.ORIENTATION_RADIUS + 1, kernels.ORIENTATION_SIGMA),
-                kernels.gaussian(kernels.GRID, kernels.DESCRIPTOR_SIGMA),
-            )
-
-            def run(start: int, stop: int) -> None:
-                kernels.describe(
-                    sums, self._pad, shape[0], shape[1], candidates, self.upright, self.extended,
-                    *weights, start, stop, angles, descriptors,
-                )  # fmt: skip
-
-            chunks = max(1, min(self.threads, n // MIN_CHUNK))
-            bounds = np.linspace(0, n, chunks + 1).astype(int).tolist()
-            self._run([lambda a=a, b=b: run(a, b) for a, b in pairwise(bounds)])  # type: ignore[misc]
-        keep = angles >= 0
-        if not keep.all():
-            candidates, angles = candidates[keep], angles[keep]
-            descriptors = descriptors[keep] if described else descriptors
+        if n and not self.upright:
+            self._orient(plane, candidates, angles)
+        if n and described:
+            self._run(self._descriptor_tasks(plane, candidates, angles, descriptors))
+        order = order[angles[order] >= 0]
+        candidates = candidates[order]
         return Features(
-            xy=np.ascontiguousarray(candidates[:, :2]),
+            xy=candidates[:, :2].copy(),
             size=candidates[:, 2].copy(),
-            angle=angles,
+            angle=angles[order],
             response=candidates[:, 3].copy(),
             laplacian=candidates[:, 5].astype(np.int8),
-            descriptors=descriptors,
+            descriptors=descriptors[order] if described else descriptors,
         )
+
+    def _orient(self, plane: _Plane, candidates: Float32Array, angles: Float32Array) -> None:
+        from semdb.perception.features._surf_describe import orient, orientation_weights
+
+        flat, pitch = plane.sums.reshape(-1), plane.sums.shape[1]
+        weights = orientation_weights()
+
+        def run(start: int, stop: int) -> None:
+            orient(flat, pitch, plane.pad, plane.height, plane.width, candidates, weights, start, stop, angles)
+
+        shares = _shares(len(candidates), min(self.threads, len(candidates) // MIN_CHUNK))
+        self._run([partial(run, a, b) for a, b in shares])
+
+    def _descriptor_tasks(
+        self, plane: _Plane, candidates: Float32Array, angles: Float32Array, descriptors: Float32Array
+    ) -> list[Callable[[], None]]:
+        """One task per level of smoothing: make its image, describe the keypoints of its sizes from it."""
+        from semdb.perception.features._surf_describe import describe, descriptor_weights, smooth
+
+        flat, pitch = plane.sums.reshape(-1), plane.sums.shape[1]
+        weights = descriptor_weights()
+
+        def run(key: int, chosen: npt.NDArray[np.intp]) -> None:
+            level = level_of(key)
+            rows, columns = level.samples(plane.height), level.samples(plane.width)
+            reach = 15 * CELL * candidates[chosen, 2].max() + 2 * level.step  # of a window turned by 45 degrees
+            y = candidates[chosen, 1] + level.margin
+            first = min(max(int((y.min() - reach) / level.step), 0), rows - 2)
+            last = max(min(int((y.max() + reach) / level.step) + 2, rows), first + 2)
+            grey = self._scratch.array("grey", ((last - first) * columns,), np.float32)
+            smooth(
+                flat,
+                pitch,
+                plane.pad,
+                level.step,
+                level.half,
+                level.edge,
+                level.margin,
+                first,
+                last - first,
+                columns,
+                grey,
+            )
+            describe(
+                grey, level.step, level.margin, first, rows, columns, candidates, angles,
+                chosen, self.extended, weights, descriptors,
+            )  # fmt: skip
+
+        keys = np.where(angles >= 0, level_keys(candidates[:, 2]), -1)
+        return [partial(run, int(key), np.flatnonzero(keys == key)) for key in np.unique(keys) if key >= 0]
 
     def _run(self, tasks: Sequence[Callable[[], Any]]) -> list[Any]:
         if self.threads == 1 or len(tasks) < 2:
@@ -228,6 +268,36 @@ class SURF:
             if self._pool is None:
                 self._pool = ThreadPoolExecutor(self.threads, thread_name_prefix="surf")
         return [future.result() for future in [self._pool.submit(task) for task in tasks]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Plane:
+    """Integral image of an image of `height` x `width` with `pad` pixels of its border repeated around it."""
+
+    sums: npt.NDArray[np.int32]
+    pad: int
+    height: int
+    width: int
+
+
+class _Scratch(threading.local):
+    """Arrays that a thread uses again at its next call: fresh memory costs more than what is computed in it."""
+
+    def __init__(self) -> None:
+        self._arrays: dict[str, npt.NDArray[Any]] = {}
+
+    def array(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+        size = math.prod(shape)
+        held = self._arrays.get(name)
+        if held is None or held.size < size:
+            held = self._arrays[name] = np.empty(size, dtype)
+        return held[:size].reshape(shape)
+
+
+def _shares(n: int, parts: int) -> list[tuple[int, int]]:
+    """0 to n in `parts` ranges of about the same length, at least one, none empty."""
+    bounds = np.linspace(0, n, max(parts, 1) + 1).astype(int).tolist()
+    return [(a, b) for a, b in pairwise(bounds) if a < b]
 
 
 def _checked(image: ImageArray) -> ImageArray:
