@@ -9,13 +9,14 @@ import csv
 import json
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from semdb.errors import UsageError
 from semdb.geometry import pose_error
 from semdb.types import FloatArray, Localization, ModelInfo, Verdict
 
@@ -211,10 +212,13 @@ def to_json(result: EvaluationResult) -> dict[str, Any]:
 
 
 def write_json(path: Path, results: Sequence[EvaluationResult]) -> None:
-    """One object for one result, a list of them for several. Raises OSError where `path` cannot be written."""
+    """One object for one result, a list of them for several. Raises UsageError where `path` cannot be written."""
     objects = [to_json(result) for result in results]
     text = json.dumps(objects[0] if len(objects) == 1 else objects, indent=2, allow_nan=False)
-    path.write_text(text + "\n", encoding="utf-8")
+    try:
+        path.write_text(text + "\n", encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"the results cannot be written to {path}: {error.strerror}") from error
 
 
 CSV_COLUMNS = (
@@ -238,15 +242,23 @@ CSV_COLUMNS = (
 
 
 def write_queries_csv(path: Path, results: Sequence[EvaluationResult]) -> None:
-    """One row per query of every result; an empty cell where a value is undefined. Raises OSError."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, CSV_COLUMNS, extrasaction="ignore", lineterminator="\n")
-        writer.writeheader()
-        for result in results:
-            shared = {"recording": result.recording, "method": result.method, "keyframes": result.keyframes}
-            for query in result.per_query:
-                total = _finite(query.timing_ms.get("total"))
-                writer.writerow({**_query_to_json(query), **shared, "total_ms": total})
+    """One row per query of every result; an empty cell where a value is undefined.
+
+    Raises UsageError where `path` cannot be written.
+    """
+    try:
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, CSV_COLUMNS, extrasaction="ignore", lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(row for result in results for row in _csv_rows(result))
+    except OSError as error:
+        raise UsageError(f"the queries cannot be written to {path}: {error.strerror}") from error
+
+
+def _csv_rows(result: EvaluationResult) -> Iterator[dict[str, Any]]:
+    shared = {"recording": result.recording, "method": result.method, "keyframes": result.keyframes}
+    for query in result.per_query:
+        yield {**_query_to_json(query), **shared, "total_ms": _finite(query.timing_ms.get("total"))}
 
 
 def _query_to_json(query: QueryResult) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from semdb.errors import UsageError
 from semdb.evaluation.metrics import (
     TIMING_STAGES,
     EvaluationResult,
@@ -141,6 +142,13 @@ def test_csv_of_queries(tmp_path: Path) -> None:
     assert (float(rows[1]["rotation_deg"]), float(rows[1]["total_ms"])) == (6.0, 20.0)
     assert (rows[5]["verdict"], rows[5]["translation_m"]) == ("failed", "")
     assert (rows[5]["keyframes_matched"], rows[5]["reason"]) == ("8", "why")
+
+
+def test_files_that_cannot_be_written_are_named(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"cannot be written to .*missing"):
+        write_json(tmp_path / "missing" / "r.json", [summary(CASE)])
+    with pytest.raises(UsageError, match=r"cannot be written to .*missing"):
+        write_queries_csv(tmp_path / "missing" / "q.csv", [summary(CASE)])
 
 
 def test_query_result_of_a_localization() -> None:
