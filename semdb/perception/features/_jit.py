@@ -12,6 +12,9 @@ import numba
 
 logger = logging.getLogger(__name__)
 
+# errors as in numpy: a test for division by zero in a loop would keep it from being vectorised
+_OPTIONS = {"nogil": True, "error_model": "numpy"}
+
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
@@ -22,10 +25,10 @@ def kernel(function: _Function) -> _Function:
     """
     _check_named_folder(numba.config.CACHE_DIR)
     try:
-        return numba.njit(function, nogil=True, cache=True)  # type: ignore[no-any-return]
+        return numba.njit(function, cache=True, **_OPTIONS)  # type: ignore[no-any-return]
     except RuntimeError as error:  # numba found no folder that it may write
         _warn_uncached(str(error))
-        return numba.njit(function, nogil=True)  # type: ignore[no-any-return]
+        return numba.njit(function, **_OPTIONS)  # type: ignore[no-any-return]
 
 
 @lru_cache(maxsize=8)

@@ -94,19 +94,20 @@ def _sector_bins(gx: Any, gy: Any, bins: Any) -> None:
     for k in range(ACROSS * ACROSS):
         x, y = gx[k], gy[k]
         ax, ay = abs(x), abs(y)
-        t = min(ax, ay) / (max(ax, ay) + np.float32(1e-20))
+        steep = ay > ax
+        t = (ax if steep else ay) / ((ay if steep else ax) + np.float32(1e-20))
         t2 = t * t
         r = np.float32(0.0208351) * t2 - np.float32(0.0851330)
         r = r * t2 + np.float32(0.1801410)
         r = r * t2 - np.float32(0.3302995)
         r = (r * t2 + np.float32(0.9998660)) * t * np.float32(DEGREES)
-        r = np.float32(90) - r if ay > ax else r
+        r = np.float32(90) - r if steep else r
         r = np.float32(180) - r if x < 0 else r
         r = np.float32(360) - r if y < 0 else r
-        angle = np.int32(np.rint(r))
-        angle = np.int32(0) if angle == 360 else angle
-        fives = np.int32(np.float32(angle) * np.float32(0.2) + np.float32(0.05))
-        bins[k] = np.int32(2) * fives + np.int32(angle != np.int32(5) * fives)
+        angle = np.int32(r + np.float32(0.5))
+        angle = np.int32(0) if angle == np.int32(360) else angle
+        fives = np.int32((np.float32(angle) + np.float32(0.5)) * np.float32(0.2))
+        bins[k] = np.int32(np.int32(2) * fives) + np.int32(angle != np.int32(np.int32(5) * fives))
 
 
 @kernel
@@ -177,6 +178,7 @@ def smooth(sums: Any, pitch: int, pad: int, step: int, half: int, edge: float, m
     w11 = np.float32(edge * edge * scale)
     inner = np.empty(pitch, np.int32)
     wide = np.empty(pitch, np.int32)
+    line = np.empty(pitch, np.float32)
     left = pad - margin - half
     i0, i1 = np.uintp(left), np.uintp(left + 2 * half + 1)
     r0, r1 = np.uintp(left - 1), np.uintp(left + 2 * half + 2)
@@ -188,76 +190,104 @@ def smooth(sums: Any, pitch: int, pad: int, step: int, half: int, edge: float, m
             x = np.uintp(i)
             inner[x] = np.int32(sums[b + x] - sums[a + x])
             wide[x] = np.int32(sums[d + x] - sums[c + x])
-        target = np.uintp(k * columns)
-        for i in range(columns):
-            x = np.uintp(i) * np.uintp(step)
+        for i in range((columns - 1) * step + 1):
+            x = np.uintp(i)
             box = np.float32(np.int32(inner[i1 + x] - inner[i0 + x])) * w00
-            box += np.float32(np.int32(inner[r1 + x] - inner[r0 + x])) * w01
-            box += np.float32(np.int32(wide[i1 + x] - wide[i0 + x])) * w01
-            box += np.float32(np.int32(wide[r1 + x] - wide[r0 + x])) * w11
-            out[target + np.uintp(i)] = box
+            rim = np.int32(np.int32(inner[r1 + x] - inner[r0 + x]) + np.int32(wide[i1 + x] - wide[i0 + x]))
+            corner = np.float32(np.int32(wide[r1 + x] - wide[r0 + x])) * w11
+            line[x] = box + np.float32(rim) * w01 + corner
+        target = np.uintp(k * columns)
+        if step == 1:
+            for i in range(columns):
+                out[target + np.uintp(i)] = line[i]
+        else:
+            for i in range(columns):
+                out[target + np.uintp(i)] = line[i * step]
 
 
 @kernel
-def _sample(grey: Any, first: int, rows: int, columns: int, x: Any, y: Any, dx: Any, dy: Any, means: Any) -> None:
+def _sample(grey: Any, first: int, rows: int, columns: int, x: Any, y: Any, dx: Any, dy: Any, lattice: Any,
+            at: Any, fx: Any, fy: Any, means: Any) -> None:  # fmt: skip
     """means[i * 21 + j]: the smooth image, bilinear, at cell (i, j) of the turned grid centred at (x, y).
 
     One cell to the right is (dx, dy), one down is (-dy, dx), in its samples. `grey` holds its rows from `first` on; it
-    has `rows` in all, and positions beyond its border are moved to the border.
+    has `rows` in all, and positions beyond its border are moved to the border. `lattice` [2, 441] has the offsets j
+    and i of the cells. Places first, reads after: so the first loop is vectorised.
     """
-    right, bottom = np.float32(columns - 1.01), np.float32(rows - 1.01)
-    low = np.uintp(columns)
-    one = np.uintp(1)
-    k = 0
-    for i in range(-(GRID // 2), GRID // 2 + 1):
-        u, v = x - i * dy, y + i * dx
-        for j in range(-(GRID // 2), GRID // 2 + 1):
-            p = min(max(u + j * dx, np.float32(0)), right)
-            q = min(max(v + j * dy, np.float32(0)), bottom)
-            ip, iq = np.int32(p), np.int32(q)
-            fp, fq = p - np.float32(ip), q - np.float32(iq)
-            at = np.uintp((iq - first) * columns + ip)
-            top = grey[at] + fp * (grey[at + one] - grey[at])
-            below = grey[at + low] + fp * (grey[at + low + one] - grey[at + low])
-            means[k] = top + fq * (below - top)
-            k += 1
+    right, bottom, zero = np.float32(columns - 1.01), np.float32(rows - 1.01), np.float32(0)
+    pitch, begin = np.int32(columns), np.int32(first)
+    for k in range(CELLS * CELLS):
+        u, v = lattice[0, k], lattice[1, k]
+        p = x + (u * dx - v * dy)
+        q = y + (u * dy + v * dx)
+        p = zero if p < zero else p
+        p = right if p > right else p
+        q = zero if q < zero else q
+        q = bottom if q > bottom else q
+        ip, iq = np.int32(p), np.int32(q)
+        fx[k], fy[k] = p - np.float32(ip), q - np.float32(iq)
+        at[k] = np.int32(np.int32(np.int32(iq - begin) * pitch) + ip)
+    one, low = np.uintp(1), np.uintp(columns)
+    for k in range(CELLS * CELLS):
+        o = np.uintp(at[k])
+        a, b = grey[o], grey[o + low]
+        top = a + fx[k] * (grey[o + one] - a)
+        below = b + fx[k] * (grey[o + low + one] - b)
+        means[k] = top + fy[k] * (below - top)
 
 
 @kernel
-def _collect(means: Any, weights: Any, extended: bool, gx: Any, gy: Any, out: Any) -> None:
-    """Sums of the weighted gradients in 4x4 fields of 5x5, as a unit vector."""
+def _collect(means: Any, weights: Any, fields: Any, out: Any) -> None:
+    """64-d: sums of the weighted gradients dx, dy, |dx|, |dy| in 4x4 fields of 5x5. `fields` float32 [4, 20] is scratch."""
+    for row in range(4):
+        for j in range(GRID):
+            fields[0, j] = fields[1, j] = fields[2, j] = fields[3, j] = 0
+        for i in range(row * 5, row * 5 + 5):
+            k, l = np.uintp(i * CELLS), np.uintp(i * GRID)
+            for j in range(GRID):
+                x = np.uintp(j)
+                a, b = means[k + x], means[k + x + np.uintp(1)]
+                c, d = means[k + x + np.uintp(CELLS)], means[k + x + np.uintp(CELLS + 1)]
+                w = weights[l + x]
+                dx = ((b - a) + (d - c)) * w
+                dy = ((c - a) + (d - b)) * w
+                fields[0, j] += dx
+                fields[1, j] += dy
+                fields[2, j] += abs(dx)
+                fields[3, j] += abs(dy)
+        for field in range(4):
+            for q in range(4):
+                total = np.float32(0)
+                for j in range(5):
+                    total += fields[q, field * 5 + j]
+                out[(row * 4 + field) * 4 + q] = total
+
+
+@kernel
+def _collect_extended(means: Any, weights: Any, out: Any) -> None:
+    """128-d: the sums of dx and |dx| apart for dy < 0 and dy >= 0, those of dy and |dy| for dx < 0 and dx >= 0."""
+    out[:] = 0
     for i in range(GRID):
         for j in range(GRID):
-            k = np.uintp(i * CELLS + j)
-            a, b = means[k], means[k + np.uintp(1)]
-            c, d = means[k + np.uintp(CELLS)], means[k + np.uintp(CELLS + 1)]
-            w = weights[i * GRID + j]
-            gx[i * GRID + j] = ((b - a) + (d - c)) * w
-            gy[i * GRID + j] = ((c - a) + (d - b)) * w
-    width = 8 if extended else 4
-    for k in range(len(out)):
-        out[k] = 0
-    for i in range(GRID):
-        for field in range(4):
-            k = (i // 5 * 4 + field) * width
-            for j in range(i * GRID + field * 5, i * GRID + field * 5 + 5):
-                dx, dy = gx[j], gy[j]
-                if not extended:
-                    out[k] += dx
-                    out[k + 1] += dy
-                    out[k + 2] += abs(dx)
-                    out[k + 3] += abs(dy)
-                else:
-                    p = k if dy >= 0 else k + 2
-                    out[p] += dx
-                    out[p + 1] += abs(dx)
-                    q = k + 4 if dx >= 0 else k + 6
-                    out[q] += dy
-                    out[q + 1] += abs(dy)
-    norm = np.float32(0)
+            k = i * CELLS + j
+            a, b, c, d = means[k], means[k + 1], means[k + CELLS], means[k + CELLS + 1]
+            dx = ((b - a) + (d - c)) * weights[i * GRID + j]
+            dy = ((c - a) + (d - b)) * weights[i * GRID + j]
+            field = (i // 5 * 4 + j // 5) * 8
+            p = field if dy >= 0 else field + 2
+            out[p] += dx
+            out[p + 1] += abs(dx)
+            q = field + 4 if dx >= 0 else field + 6
+            out[q] += dy
+            out[q + 1] += abs(dy)
+
+
+@kernel
+def _normalise(out: Any) -> None:
+    norm = 0.0
     for k in range(len(out)):
         norm += out[k] * out[k]
-    scale = np.float32(1.0) / (np.sqrt(norm) + np.float32(1e-7))
+    scale = np.float32(1.0 / (math.sqrt(norm) + 1e-7))
     for k in range(len(out)):
         out[k] *= scale
 
@@ -270,13 +300,23 @@ def describe(grey: Any, step: int, margin: int, first: int, rows: int, columns: 
     `rows` is how many rows the image would have in all.
     """
     means = np.empty(CELLS * CELLS, np.float32)
-    gx = np.empty(GRID * GRID, np.float32)
-    gy = np.empty(GRID * GRID, np.float32)
+    at = np.empty(CELLS * CELLS, np.int32)
+    fx = np.empty(CELLS * CELLS, np.float32)
+    fy = np.empty(CELLS * CELLS, np.float32)
+    fields = np.empty((4, GRID), np.float32)
+    lattice = np.empty((2, CELLS * CELLS), np.float32)
+    for k in range(CELLS * CELLS):
+        lattice[0, k] = k % CELLS - GRID // 2
+        lattice[1, k] = k // CELLS - GRID // 2
     for k in chosen:
         side = math.floor(CELLS * candidates[k, 2] * 1.2 / 9.0) / CELLS / step
         angle = angles[k] / DEGREES
         x = np.float32((candidates[k, 0] + margin) / step)
         y = np.float32((candidates[k, 1] + margin) / step)
         dx, dy = np.float32(math.cos(angle) * side), np.float32(math.sin(angle) * side)
-        _sample(grey, first, rows, columns, x, y, dx, dy, means)
-        _collect(means, weights, extended, gx, gy, descriptors[k])
+        _sample(grey, first, rows, columns, x, y, dx, dy, lattice, at, fx, fy, means)
+        if extended:
+            _collect_extended(means, weights, descriptors[k])
+        else:
+            _collect(means, weights, fields, descriptors[k])
+        _normalise(descriptors[k])
