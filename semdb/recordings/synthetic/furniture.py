@@ -8,7 +8,7 @@ import numpy as np
 
 from semdb.recordings.synthetic import pictures, textures
 from semdb.recordings.synthetic.scene import Material, Prim, Texture, ball, box, cylinder
-from semdb.recordings.synthetic.textures import Colour, Rng, random_colour, shift
+from semdb.recordings.synthetic.textures import Colour, Rng, cloth_colour, random_colour, shift
 
 
 class Palette:
@@ -19,7 +19,7 @@ class Palette:
         woods = ((158, 112, 70), (196, 158, 112), (110, 72, 46), (216, 190, 152), (140, 100, 76))
         chosen = rng.permutation(len(woods))
         self.wood = [self.repeat(textures.wood(rng, woods[k]), 0.7) for k in chosen[:3]]
-        fabrics = [textures.fabric(rng, random_colour(rng), str(p)) for p in rng.permutation(textures.PATTERNS)]
+        fabrics = [textures.fabric(rng, cloth_colour(rng), str(p)) for p in rng.permutation(textures.PATTERNS)]
         self.cloth = [self.repeat(f, 0.45) for f in fabrics]
         self.white = self.repeat(textures.speckle(rng, (222, 220, 214), 0.02), 0.5)
         self.dark = self.repeat(textures.speckle(rng, (44, 44, 48), 0.07), 0.5)
@@ -120,7 +120,9 @@ def refrigerator(p: Palette) -> list[Prim]:
 def oven(p: Palette) -> list[Prim]:
     prims = [box((0, 0.3, 0), (0.6, 0.6, 0.88), p.white), box((0, 0.605, 0.2), (0.5, 0.02, 0.42), p.dark)]
     prims.append(cylinder((-0.22, 0.64, 0.68), 0.012, 0.44, p.metal, turn=(0, np.pi / 2, 0)))
-    prims += [cylinder((x, 0.6, 0.79), 0.022, 0.025, p.dark, turn=(-np.pi / 2, 0, 0)) for x in np.linspace(-0.2, 0.2, 5)]
+    prims += [
+        cylinder((x, 0.6, 0.79), 0.022, 0.025, p.dark, turn=(-np.pi / 2, 0, 0)) for x in np.linspace(-0.2, 0.2, 5)
+    ]
     prims += [cylinder((x, y, 0.88), 0.09, 0.008, p.dark) for x in (-0.15, 0.15) for y in (0.16, 0.44)]
     return prims
 
@@ -204,17 +206,21 @@ def plant(p: Palette, glaze: Material, size: float) -> list[Prim]:
     """A pot with leaves, `size` metres high."""
     r, h = 0.18 * size, 0.3 * size
     prims = [cylinder((0, 0, 0), 0.75 * r, h, glaze, r, cap=Material(p.leaf.texture, tint=(0.5, 0.35, 0.25)))]
-    for k in range(22):
-        yaw, lift = 2.4 * k + p.rng.uniform(-0.3, 0.3), p.rng.uniform(0.25, 1.35)
-        length = size * p.rng.uniform(0.16, 0.26)
-        z = h + size * p.rng.uniform(0.02, 0.4)
-        reach = 0.7 * length * np.cos(lift) + 0.02
-        centre = (reach * np.cos(yaw), reach * np.sin(yaw), z + 0.7 * length * np.sin(lift))
-        turn = _turn(float(yaw), float(lift))
-        shade = float(p.rng.uniform(0.65, 1.15))
+    bushy = bool(p.rng.random() < 0.5)
+    for k in range(44 if bushy else 22):
+        yaw, lift = 2.4 * k + p.rng.uniform(-0.3, 0.3), p.rng.uniform(0.1, 1.3)
+        length = size * (p.rng.uniform(0.06, 0.1) if bushy else p.rng.uniform(0.16, 0.26))
+        z = h + size * p.rng.uniform(0.02, 0.55 if bushy else 0.4)
+        reach = (
+            size * p.rng.uniform(0.02, 0.2) * (1.3 - (z - h) / size) if bushy else 0.7 * length * np.cos(lift) + 0.02
+        )
+        rise = 0.2 * length if bushy else 0.7 * length * np.sin(lift)
+        centre = (float(reach * np.cos(yaw)), float(reach * np.sin(yaw)), float(z + rise))
+        shade = float(p.rng.uniform(0.65, 1.2))
         leaf = Material(p.leaf.texture, tint=(shade, shade, shade * 0.9))
-        prims.append(ball(centre, (length, 0.05 * size + 0.01, 0.008), leaf, turn))
-    prims.append(cylinder((0, 0, h), 0.02 * size, 0.45 * size, p.wood[0]))
+        wide = 0.042 * size if bushy else 0.03 * size + 0.008
+        prims.append(ball(centre, (float(length), wide, 0.006), leaf, _turn(float(yaw), float(lift))))
+    prims.append(cylinder((0, 0, h), 0.015 * size, 0.5 * size, p.wood[0]))
     return prims
 
 
@@ -252,7 +258,9 @@ def remote(p: Palette) -> list[Prim]:
 
 
 def cell_phone(p: Palette) -> list[Prim]:
-    return [box((0, 0, 0), (0.075, 0.15, 0.009), p.dark, top=p.once(lambda r: pictures.screen(r, 256, 256), emissive=True))]
+    return [
+        box((0, 0, 0), (0.075, 0.15, 0.009), p.dark, top=p.once(lambda r: pictures.screen(r, 256, 256), emissive=True))
+    ]
 
 
 def toaster(p: Palette) -> list[Prim]:

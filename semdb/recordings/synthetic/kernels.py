@@ -7,13 +7,11 @@ A ray is ``o + t d`` in the frame of a primitive; rays of the camera have ``d_z 
 from __future__ import annotations
 
 import math
-from typing import Any
-
 import numba
 import numpy as np
 
 BOX, FRUSTUM, ELLIPSOID, ROOM = 0, 1, 2, 3
-TILE = 16  # pixels
+TILE = 8  # pixels
 SUBSAMPLES = 3  # per pixel side, at edges
 PROBES = 8  # most texture probes along the long axis of a pixel's footprint
 FAR = 1e30
@@ -35,10 +33,11 @@ def _hit_box(ox, oy, oz, dx, dy, dz, hx, hy, hz, inside):  # type: ignore[no-unt
             if abs(o) > h:
                 return FAR, 0
             continue
+        inverse = 1.0 / d
         if d > 0:
-            t0, t1, f0, f1 = (-h - o) / d, (h - o) / d, 2 * axis + 1, 2 * axis
+            t0, t1, f0, f1 = (-h - o) * inverse, (h - o) * inverse, 2 * axis + 1, 2 * axis
         else:
-            t0, t1, f0, f1 = (h - o) / d, (-h - o) / d, 2 * axis, 2 * axis + 1
+            t0, t1, f0, f1 = (h - o) * inverse, (-h - o) * inverse, 2 * axis, 2 * axis + 1
         if t0 > t_in:
             t_in, f_in = t0, f0
         if t1 < t_out:
@@ -75,14 +74,14 @@ def _hit_frustum(ox, oy, oz, dx, dy, dz, r0, r1, h):  # type: ignore[no-untyped-
 
 
 @_njit
-def _hit(kind, o, d, half, top):  # type: ignore[no-untyped-def]
+def _hit(kind, ox, oy, oz, dx, dy, dz, hx, hy, hz, top):  # type: ignore[no-untyped-def]
     """First hit of a primitive in its own frame: (t, face), t = FAR for none."""
     if kind == BOX or kind == ROOM:
-        return _hit_box(o[0], o[1], o[2], d[0], d[1], d[2], half[0], half[1], half[2], kind == ROOM)
+        return _hit_box(ox, oy, oz, dx, dy, dz, hx, hy, hz, kind == ROOM)
     if kind == FRUSTUM:
-        return _hit_frustum(o[0], o[1], o[2], d[0], d[1], d[2], half[0], top, half[2])
-    ox, oy, oz = o[0] / half[0], o[1] / half[1], o[2] / half[2]
-    dx, dy, dz = d[0] / half[0], d[1] / half[1], d[2] / half[2]
+        return _hit_frustum(ox, oy, oz, dx, dy, dz, hx, top, hz)
+    ox, oy, oz = ox / hx, oy / hy, oz / hz
+    dx, dy, dz = dx / hx, dy / hy, dz / hz
     a, b, c = dx * dx + dy * dy + dz * dz, ox * dx + oy * dy + oz * dz, ox * ox + oy * oy + oz * oz - 1
     disc = b * b - a * c
     if disc <= 0:
@@ -92,53 +91,41 @@ def _hit(kind, o, d, half, top):  # type: ignore[no-untyped-def]
 
 
 @_njit
-def _surface(kind, face, p, half, top, n, gu, gv):  # type: ignore[no-untyped-def]
-    """(u, v) 0..1 of point `p` on a face; writes the outward normal and the gradients of u and v."""
-    for i in range(3):
-        n[i] = 0.0
-        gu[i] = 0.0
-        gv[i] = 0.0
+def _surface(kind, face, x, y, z, hx, hy, hz, top):  # type: ignore[no-untyped-def]
+    """(u, v) 0..1, outward normal and the gradients of u and v, of point (x, y, z) on a face: 11 numbers."""
     if kind == BOX or kind == ROOM:
-        axis, sign = face // 2, 1.0 - 2.0 * (face % 2)
-        n[axis] = sign
-        if axis == 0:
-            ua, us, va = 1, sign, 2
-        elif axis == 1:
-            ua, us, va = 0, -sign, 2
-        else:
-            ua, us, va = 0, sign, 1
-        if kind == ROOM:
-            us = -us
-            n[axis] = -sign
-        gu[ua] = us / (2 * half[ua])
-        gv[va] = -1 / (2 * half[va])
-        return 0.5 + gu[ua] * p[ua], 0.5 + gv[va] * p[va]
+        sign = 1.0 - 2.0 * (face % 2)
+        side = -1.0 if kind == ROOM else 1.0  # the room is seen from inside
+        if face < 2:
+            g = sign * side / (2 * hy)
+            return 0.5 + g * y, 0.5 - 0.5 * z / hz, sign * side, 0.0, 0.0, 0.0, g, 0.0, 0.0, 0.0, -0.5 / hz
+        if face < 4:
+            g = -sign * side / (2 * hx)
+            return 0.5 + g * x, 0.5 - 0.5 * z / hz, 0.0, sign * side, 0.0, g, 0.0, 0.0, 0.0, 0.0, -0.5 / hz
+        g = sign * side / (2 * hx)
+        return 0.5 + g * x, 0.5 - 0.5 * y / hy, 0.0, 0.0, sign * side, g, 0.0, 0.0, 0.0, -0.5 / hy, 0.0
     if kind == FRUSTUM:
         if face == 0:
-            k = 0.5 * (top - half[0]) / half[2]
-            r = max(math.sqrt(p[0] * p[0] + p[1] * p[1]), 1e-9)
-            norm = math.sqrt(1 + k * k)
-            n[0], n[1], n[2] = p[0] / r / norm, p[1] / r / norm, -k / norm
-            gu[0], gu[1] = -p[1] / (r * r * 2 * math.pi), p[0] / (r * r * 2 * math.pi)
-            gv[2] = -0.5 / half[2]
-            return math.atan2(p[1], p[0]) / (2 * math.pi) + 0.5, 0.5 + gv[2] * p[2]
-        r = max(top if face == 1 else half[0], 1e-9)
-        n[2] = 1.0 if face == 1 else -1.0
-        gu[0], gv[1] = 0.5 / r, -0.5 / r
-        return 0.5 + gu[0] * p[0], 0.5 + gv[1] * p[1]
-    qx, qy = p[0] / half[0], p[1] / half[1]
-    r2 = max(qx * qx + qy * qy, 1e-6)
-    n[0], n[1], n[2] = qx / half[0], qy / half[1], p[2] / (half[2] * half[2])
-    norm = math.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2])
-    n[0], n[1], n[2] = n[0] / norm, n[1] / norm, n[2] / norm
-    gu[0], gu[1] = -qy / (half[0] * r2 * 2 * math.pi), qx / (half[1] * r2 * 2 * math.pi)
-    gv[2] = -0.5 / half[2]
-    return math.atan2(qy, qx) / (2 * math.pi) + 0.5, 0.5 + gv[2] * p[2]
+            k = 0.5 * (top - hx) / hz
+            r2 = max(x * x + y * y, 1e-12)
+            r, norm = math.sqrt(r2), math.sqrt(1 + k * k)
+            turn = r2 * 2 * math.pi
+            u, v, gv = math.atan2(y, x) / (2 * math.pi) + 0.5, 0.5 - 0.5 * z / hz, -0.5 / hz
+            return u, v, x / r / norm, y / r / norm, -k / norm, -y / turn, x / turn, 0.0, 0.0, 0.0, gv
+        r = max(top if face == 1 else hx, 1e-9)
+        up = 1.0 if face == 1 else -1.0
+        return 0.5 + 0.5 * x / r, 0.5 - 0.5 * y / r, 0.0, 0.0, up, 0.5 / r, 0.0, 0.0, 0.0, -0.5 / r, 0.0
+    qx, qy = x / hx, y / hy
+    turn = max(qx * qx + qy * qy, 1e-6) * 2 * math.pi
+    nx, ny, nz = qx / hx, qy / hy, z / (hz * hz)
+    norm = math.sqrt(nx * nx + ny * ny + nz * nz)
+    u, v, gv = math.atan2(qy, qx) / (2 * math.pi) + 0.5, 0.5 - 0.5 * z / hz, -0.5 / hz
+    return u, v, nx / norm, ny / norm, nz / norm, -qy / (hx * turn), qx / (hy * turn), 0.0, 0.0, 0.0, gv
 
 
 @_njit
-def _fetch(texels, offset, w, h, wrap, x, y, weight, out):  # type: ignore[no-untyped-def]
-    """Adds `weight` times the bilinear sample at texel coordinates (x, y) of one level to `out`."""
+def _fetch(texels, offset, w, h, wrap, x, y):  # type: ignore[no-untyped-def]
+    """Bilinear sample (r, g, b) at texel coordinates (x, y) of one level."""
     x -= 0.5
     y -= 0.5
     xf, yf = math.floor(x), math.floor(y)
@@ -150,23 +137,25 @@ def _fetch(texels, offset, w, h, wrap, x, y, weight, out):  # type: ignore[no-un
     else:
         x0, x1 = min(max(x0, 0), w - 1), min(max(x1, 0), w - 1)
         y0, y1 = min(max(y0, 0), h - 1), min(max(y1, 0), h - 1)
-    i00, i01 = offset + 3 * (y0 * w + x0), offset + 3 * (y0 * w + x1)
-    i10, i11 = offset + 3 * (y1 * w + x0), offset + 3 * (y1 * w + x1)
-    w00, w01, w10, w11 = (1 - ax) * (1 - ay), ax * (1 - ay), (1 - ax) * ay, ax * ay
-    for c in range(3):
-        value = w00 * texels[i00 + c] + w01 * texels[i01 + c] + w10 * texels[i10 + c] + w11 * texels[i11 + c]
-        out[c] += weight * value
+    a, b = offset + 3 * (y0 * w + x0), offset + 3 * (y0 * w + x1)
+    c, d = offset + 3 * (y1 * w + x0), offset + 3 * (y1 * w + x1)
+    wa, wb, wc, wd = (1 - ax) * (1 - ay), ax * (1 - ay), (1 - ax) * ay, ax * ay
+    return (
+        wa * texels[a] + wb * texels[b] + wc * texels[c] + wd * texels[d],
+        wa * texels[a + 1] + wb * texels[b + 1] + wc * texels[c + 1] + wd * texels[d + 1],
+        wa * texels[a + 2] + wb * texels[b + 2] + wc * texels[c + 2] + wd * texels[d + 2],
+    )
 
 
 @_njit
-def _texture(texels, table, tex, u, v, j, out):  # type: ignore[no-untyped-def]
-    """Writes the texture `tex` filtered over a pixel's footprint to `out`.
+def _texture(texels, table, tex, u, v, jux, jvx, juy, jvy):  # type: ignore[no-untyped-def]
+    """The texture `tex` filtered over a pixel's footprint: (r, g, b).
 
-    `j` = (du/dx, dv/dx, du/dy, dv/dy). Probes along the long axis of the footprint ellipse, each trilinear at the
-    level of the short axis (anisotropic filtering), so that there is neither aliasing nor needless blur.
+    jux is du/dx and so on. Probes along the long axis of the footprint ellipse, each trilinear at the level of the
+    short axis (anisotropic filtering), so that there is neither aliasing nor needless blur.
     """
     w, h, levels, wrap = table[tex, 0], table[tex, 1], table[tex, 2], table[tex, 3]
-    ax, ay, bx, by = j[0] * w, j[1] * h, j[2] * w, j[3] * h
+    ax, ay, bx, by = jux * w, jvx * h, juy * w, jvy * h
     e, f, g = ax * ax + bx * bx, ax * ay + bx * by, ay * ay + by * by
     root = math.sqrt((e - g) ** 2 + 4 * f * f)
     major = math.sqrt(max(0.5 * (e + g + root), 1e-12))
@@ -177,26 +166,28 @@ def _texture(texels, table, tex, u, v, j, out):  # type: ignore[no-untyped-def]
         mx, my = mx / norm * major, my / norm * major
     else:
         mx, my = major, 0.0
-    probes = int(min(max(math.ceil(major / max(minor, 1.0) - 0.2), 1), PROBES))
+    probes = int(min(max(math.ceil(major / max(minor, 1.0) - 0.5), 1), PROBES))
     level = min(max(math.log2(max(minor, major / probes)), 0.0), levels - 1.0)
     low = int(level)
     blend = level - low
-    out[0] = out[1] = out[2] = 0.0
+    red = green = blue = 0.0
     for i in range(probes):
         s = (i + 0.5) / probes - 0.5
         x, y = u * w + s * mx, v * h + s * my
         scale = 1.0 / (1 << low)
         wl, hl = max(w >> low, 1), max(h >> low, 1)
-        _fetch(texels, table[tex, 4 + low], wl, hl, wrap, x * scale, y * scale, (1 - blend) / probes, out)
-        if blend > 0:
-            wl, hl = max(wl >> 1, 1), max(hl >> 1, 1)
+        r, g, b = _fetch(texels, table[tex, 4 + low], wl, hl, wrap, x * scale, y * scale)
+        if blend > 0.02:
             at = table[tex, 5 + low]
-            _fetch(texels, at, wl, hl, wrap, x * scale * 0.5, y * scale * 0.5, blend / probes, out)
+            r1, g1, b1 = _fetch(texels, at, max(wl >> 1, 1), max(hl >> 1, 1), wrap, x * scale * 0.5, y * scale * 0.5)
+            r, g, b = r + blend * (r1 - r), g + blend * (g1 - g), b + blend * (b1 - b)
+        red, green, blue = red + r, green + g, blue + b
+    return red / probes, green / probes, blue / probes
 
 
 @_njit
-def _light(lightmap, offset, nu, nv, curved, u, v, out):  # type: ignore[no-untyped-def]
-    """Multiplies `out` by the baked light at (u, v) of a face."""
+def _light(lightmap, offset, nu, nv, curved, u, v):  # type: ignore[no-untyped-def]
+    """The baked light (r, g, b) at (u, v) of a face."""
     x, y = u * nu - 0.5, v * nv - 0.5
     xf, yf = math.floor(x), math.floor(y)
     ax, ay = x - xf, y - yf
@@ -207,77 +198,113 @@ def _light(lightmap, offset, nu, nv, curved, u, v, out):  # type: ignore[no-unty
         x0, x1 = (x0 + nu) % nu, (x1 + nu) % nu
     else:
         x0, x1 = min(max(x0, 0), nu - 1), min(max(x1, 0), nu - 1)
-    for c in range(3):
-        a = lightmap[offset + y0 * nu + x0, c] * (1 - ax) + lightmap[offset + y0 * nu + x1, c] * ax
-        b = lightmap[offset + y1 * nu + x0, c] * (1 - ax) + lightmap[offset + y1 * nu + x1, c] * ax
-        out[c] *= a * (1 - ay) + b * ay
+    a, b, c, d = offset + y0 * nu + x0, offset + y0 * nu + x1, offset + y1 * nu + x0, offset + y1 * nu + x1
+    wa, wb, wc, wd = (1 - ax) * (1 - ay), ax * (1 - ay), (1 - ax) * ay, ax * ay
+    return (
+        wa * lightmap[a, 0] + wb * lightmap[b, 0] + wc * lightmap[c, 0] + wd * lightmap[d, 0],
+        wa * lightmap[a, 1] + wb * lightmap[b, 1] + wc * lightmap[c, 1] + wd * lightmap[d, 1],
+        wa * lightmap[a, 2] + wb * lightmap[b, 2] + wc * lightmap[c, 2] + wd * lightmap[d, 2],
+    )
 
 
 @_njit
-def _closest(ids, start, stop, kind, o, m, half, top, near, x, y, d):  # type: ignore[no-untyped-def]
+def _closest(ids, start, stop, kind, o, m, half, top, near, x, y):  # type: ignore[no-untyped-def]
     """Nearest primitive of a tile along the camera ray (x, y, 1): (t, primitive, face). `ids` are sorted by `near`."""
     best, prim, face = FAR, -1, 0
     for k in range(start, stop):
         i = ids[k]
-        if near[i] > best:
+        if near[i, 0] > best:
             break
-        for r in range(3):
-            d[r] = m[i, r, 0] * x + m[i, r, 1] * y + m[i, r, 2]
-        t, f = _hit(kind[i], o[i], d, half[i], top[i])
+        if x < near[i, 1] or x > near[i, 2] or y < near[i, 3] or y > near[i, 4]:
+            continue
+        dx = m[i, 0, 0] * x + m[i, 0, 1] * y + m[i, 0, 2]
+        dy = m[i, 1, 0] * x + m[i, 1, 1] * y + m[i, 1, 2]
+        dz = m[i, 2, 0] * x + m[i, 2, 1] * y + m[i, 2, 2]
+        t, f = _hit(kind[i], o[i, 0], o[i, 1], o[i, 2], dx, dy, dz, half[i, 0], half[i, 1], half[i, 2], top[i])
         if t < best:
             best, prim, face = t, i, f
     return best, prim, face
 
 
 @_njit
-def _shade(scene, i, face, t, x, y, step_x, step_y, o, m, work, out):  # type: ignore[no-untyped-def]
-    """Writes the colour of primitive `i` hit at depth `t` by the ray (x, y, 1) to `out`."""
-    kind, half, top, ftex, fuv, fmap, tint, texels, table, lightmap = scene
-    p, d, n, gu, gv, j = work[0], work[1], work[2], work[3], work[4], work[5]
-    for r in range(3):
-        d[r] = m[i, r, 0] * x + m[i, r, 1] * y + m[i, r, 2]
-        p[r] = o[i, r] + t * d[r]
-    u, v = _surface(kind[i], face, p, half[i], top[i], n, gu, gv)
-    nd = n[0] * d[0] + n[1] * d[1] + n[2] * d[2]
-    nd = min(nd, -1e-3) if nd < 0 else max(nd, 1e-3)
-    su, sv = fuv[i, face, 2], fuv[i, face, 3]
-    for axis in range(2):
-        step = step_x if axis == 0 else step_y
-        n_dx = (n[0] * m[i, 0, axis] + n[1] * m[i, 1, axis] + n[2] * m[i, 2, axis]) / nd
-        ju = jv = 0.0
-        for r in range(3):
-            move = t * step * (m[i, r, axis] - d[r] * n_dx)  # of the hit point, per pixel
-            ju += gu[r] * move
-            jv += gv[r] * move
-        j[2 * axis] = ju * su
-        j[2 * axis + 1] = jv * sv
-    _texture(texels, table, ftex[i, face], fuv[i, face, 0] + su * u, fuv[i, face, 1] + sv * v, j, out)
-    for c in range(3):
-        out[c] *= tint[i, face, c]
+def _shade(kind, half, top, ftex, fuv, fmap, tint, texels, table, lightmap, i, face, t, x, y, step, o, m):  # type: ignore[no-untyped-def]
+    """The colour (r, g, b) of primitive `i` hit at depth `t` by the ray (x, y, 1); pixels are `step` apart."""
+    dx = m[i, 0, 0] * x + m[i, 0, 1] * y + m[i, 0, 2]
+    dy = m[i, 1, 0] * x + m[i, 1, 1] * y + m[i, 1, 2]
+    dz = m[i, 2, 0] * x + m[i, 2, 1] * y + m[i, 2, 2]
+    px, py, pz = o[i, 0] + t * dx, o[i, 1] + t * dy, o[i, 2] + t * dz
+    u, v, nx, ny, nz, ux, uy, uz, vx, vy, vz = _surface(
+        kind[i], face, px, py, pz, half[i, 0], half[i, 1], half[i, 2], top[i]
+    )
+    nd = min(nx * dx + ny * dy + nz * dz, -1e-3)
+    su, sv = fuv[i, face, 2] * t * step, fuv[i, face, 3] * t * step
+    # how the hit point moves on the tangent plane per pixel to the right and down
+    a = (nx * m[i, 0, 0] + ny * m[i, 1, 0] + nz * m[i, 2, 0]) / nd
+    mx, my, mz = m[i, 0, 0] - dx * a, m[i, 1, 0] - dy * a, m[i, 2, 0] - dz * a
+    jux, jvx = su * (ux * mx + uy * my + uz * mz), sv * (vx * mx + vy * my + vz * mz)
+    a = (nx * m[i, 0, 1] + ny * m[i, 1, 1] + nz * m[i, 2, 1]) / nd
+    mx, my, mz = m[i, 0, 1] - dx * a, m[i, 1, 1] - dy * a, m[i, 2, 1] - dz * a
+    juy, jvy = su * (ux * mx + uy * my + uz * mz), sv * (vx * mx + vy * my + vz * mz)
+    at_u, at_v = fuv[i, face, 0] + fuv[i, face, 2] * u, fuv[i, face, 1] + fuv[i, face, 3] * v
+    r, g, b = _texture(texels, table, ftex[i, face], at_u, at_v, jux, jvx, juy, jvy)
+    r, g, b = r * tint[i, face, 0], g * tint[i, face, 1], b * tint[i, face, 2]
     if fmap[i, face, 0] >= 0:
         curved = face == 0 and (kind[i] == FRUSTUM or kind[i] == ELLIPSOID)
-        _light(lightmap, fmap[i, face, 0], fmap[i, face, 1], fmap[i, face, 2], curved, u, v, out)
+        lr, lg, lb = _light(lightmap, fmap[i, face, 0], fmap[i, face, 1], fmap[i, face, 2], curved, u, v)
+        r, g, b = r * lr, g * lg, b * lb
+    return r, g, b
 
 
 @_njit
-def render(scene, tiles, ids, o, m, near, camera, rgb, depth, prims):  # type: ignore[no-untyped-def]
-    """Renders one view.
+def cast(kind, half, top, tiles, ids, o, m, near, focal, cx, cy, depth, prims):  # type: ignore[no-untyped-def]
+    """First pass: writes depth ``[H, W]`` (z of pixel centres, 0 for none) and prims (8 * primitive + face, or -1).
 
-    scene: arrays of `scene.PackedScene`. tiles ``[rows, cols, 2]``: range in `ids`. o ``[n, 3]``, m ``[n, 3, 3]``: camera
-    centre and rotation in the frame of each primitive. camera: (fx, fy, cx, cy). Writes rgb ``[H, W, 3]`` uint8,
-    depth ``[H, W]`` float64 (z of the pixel's centre, 0 for none), prims ``[H, W]`` int32 (8 * primitive + face).
+    tiles ``[rows, cols, 2]``: ranges in `ids`. o ``[n, 3]``, m ``[n, 3, 3]``: camera centre and rotation in the frame of
+    each primitive. near ``[n, 5]``: least depth of each primitive, and bounds of the rays (x0, x1, y0, y1) that can hit it.
     """
-    kind, half, top = scene[0], scene[1], scene[2]
-    fx, fy, cx, cy = camera
     height, width = depth.shape
-    work, out, acc = np.zeros((6, 4)), np.zeros(3), np.zeros(3)
     for v in range(height):
         for u in range(width):
-            tile = tiles[v // TILE, u // TILE]
-            x, y = (u - cx) / fx, (v - cy) / fy
-            t, i, f = _closest(ids, tile[0], tile[1], kind, o, m, half, top, near, x, y, work[1])
-            depth[v, u] = t if i >= 0 else 0.0
-            prims[v, u] = 8 * i + f if i >= 0 else -1
+            start, stop = tiles[v // TILE, u // TILE, 0], tiles[v // TILE, u // TILE, 1]
+            x, y = (u - cx) / focal, (v - cy) / focal
+            t, i, f = _closest(ids, start, stop, kind, o, m, half, top, near, x, y)
+            if i >= 0:
+                depth[v, u] = t
+                prims[v, u] = 8 * i + f
+
+
+@_njit
+def shade(
+    kind,
+    half,
+    top,
+    ftex,
+    fuv,
+    fmap,
+    tint,
+    texels,
+    table,
+    lightmap,
+    tiles,
+    ids,
+    o,
+    m,
+    near,
+    focal,
+    cx,
+    cy,
+    depth,
+    prims,
+    rgb,
+):  # type: ignore[no-untyped-def]
+    """Second pass: writes rgb ``[H, W, 3]`` uint8 from what `cast` found.
+
+    Where a pixel and its neighbours see more than one face, a grid of rays finds the share of each face in the
+    pixel, and each face is shaded once.
+    """
+    height, width = depth.shape
+    found, count = np.zeros(SUBSAMPLES**2, np.int64), np.zeros(SUBSAMPLES**2, np.int64)
+    where = np.zeros((SUBSAMPLES**2, 3))
     for v in range(height):
         for u in range(width):
             here = prims[v, u]
@@ -286,43 +313,64 @@ def render(scene, tiles, ids, o, m, near, camera, rgb, depth, prims):  # type: i
                 for du in range(-1, 2):
                     if prims[min(max(v + dv, 0), height - 1), min(max(u + du, 0), width - 1)] != here:
                         edge = True
-            if not edge:
-                x, y = (u - cx) / fx, (v - cy) / fy
-                if here >= 0:
-                    _shade(scene, here // 8, here % 8, depth[v, u], x, y, 1 / fx, 1 / fy, o, m, work, out)
-                    for c in range(3):
-                        rgb[v, u, c] = np.uint8(min(max(out[c] + 0.5, 0.0), 255.0))
-                continue
-            tile = tiles[v // TILE, u // TILE]
-            acc[0] = acc[1] = acc[2] = 0.0
-            for sv in range(SUBSAMPLES):
-                for su in range(SUBSAMPLES):
-                    x = (u + (su + 0.5) / SUBSAMPLES - 0.5 - cx) / fx
-                    y = (v + (sv + 0.5) / SUBSAMPLES - 0.5 - cy) / fy
-                    t, i, f = _closest(ids, tile[0], tile[1], kind, o, m, half, top, near, x, y, work[1])
-                    if i >= 0:
-                        _shade(scene, i, f, t, x, y, 0.5 / fx, 0.5 / fy, o, m, work, out)
-                        for c in range(3):
-                            acc[c] += out[c]
-            for c in range(3):
-                rgb[v, u, c] = np.uint8(min(max(acc[c] / SUBSAMPLES**2 + 0.5, 0.0), 255.0))
+            x, y = (u - cx) / focal, (v - cy) / focal
+            found[0], count[0] = here, 0 if edge else 1
+            where[0, 0], where[0, 1], where[0, 2] = depth[v, u], x, y
+            n = 1
+            if edge:
+                start, stop = tiles[v // TILE, u // TILE, 0], tiles[v // TILE, u // TILE, 1]
+                for k in range(SUBSAMPLES * SUBSAMPLES):
+                    xs = x + ((k % SUBSAMPLES + 0.5) / SUBSAMPLES - 0.5) / focal
+                    ys = y + ((k // SUBSAMPLES + 0.5) / SUBSAMPLES - 0.5) / focal
+                    t, i, f = _closest(ids, start, stop, kind, o, m, half, top, near, xs, ys)
+                    face = 8 * i + f if i >= 0 else -1
+                    j = 0
+                    while j < n and found[j] != face:
+                        j += 1
+                    if j == SUBSAMPLES * SUBSAMPLES:
+                        continue
+                    if j == n:
+                        found[j], count[j] = face, 0
+                        where[j, 0], where[j, 1], where[j, 2] = t, xs, ys
+                        n += 1
+                    count[j] += 1
+            red = green = blue = 0.0
+            total = 0
+            for j in range(n):
+                if count[j] == 0:
+                    continue
+                total += count[j]
+                if found[j] < 0:
+                    continue
+                r, g, b = _shade(
+                    kind, half, top, ftex, fuv, fmap, tint, texels, table, lightmap,
+                    found[j] // 8, found[j] % 8, where[j, 0], where[j, 1], where[j, 2], 1 / focal, o, m,
+                )  # fmt: skip
+                red, green, blue = red + count[j] * r, green + count[j] * g, blue + count[j] * b
+            rgb[v, u, 0] = np.uint8(min(max(red / total + 0.5, 0.0), 255.0))
+            rgb[v, u, 1] = np.uint8(min(max(green / total + 0.5, 0.0), 255.0))
+            rgb[v, u, 2] = np.uint8(min(max(blue / total + 0.5, 0.0), 255.0))
 
 
 @_njit
-def trace(bvh_box, bvh_link, order, kind, rot, centre, half, top, p, d, t_max, work):  # type: ignore[no-untyped-def]
-    """Nearest primitive along ``p + t d`` in the world, ``t < t_max``: (t, primitive or -1, face)."""
-    stack = np.empty(64, np.int64)
+def trace(bvh_box, bvh_link, order, kind, rot, centre, half, top, px, py, pz, dx, dy, dz, t_max, stack):  # type: ignore[no-untyped-def]
+    """Nearest primitive along ``p + t d`` in the world, ``t < t_max``: (t, primitive or -1, face). `stack` ``[64]`` is scratch."""
     stack[0] = 0
     size, best, prim, face = 1, t_max, -1, 0
-    o, e = work[0], work[1]
+    ix, iy, iz = (
+        1 / (dx if abs(dx) > 1e-12 else 1e-12),
+        1 / (dy if abs(dy) > 1e-12 else 1e-12),
+        1 / (dz if abs(dz) > 1e-12 else 1e-12),
+    )
     while size > 0:
         size -= 1
         node = stack[size]
-        t0, t1 = 0.0, best
-        for a in range(3):
-            inv = 1.0 / (d[a] if abs(d[a]) > 1e-12 else 1e-12)
-            ta, tb = (bvh_box[node, a] - p[a]) * inv, (bvh_box[node, 3 + a] - p[a]) * inv
-            t0, t1 = max(t0, min(ta, tb)), min(t1, max(ta, tb))
+        ta, tb = (bvh_box[node, 0] - px) * ix, (bvh_box[node, 3] - px) * ix
+        t0, t1 = max(0.0, min(ta, tb)), min(best, max(ta, tb))
+        ta, tb = (bvh_box[node, 1] - py) * iy, (bvh_box[node, 4] - py) * iy
+        t0, t1 = max(t0, min(ta, tb)), min(t1, max(ta, tb))
+        ta, tb = (bvh_box[node, 2] - pz) * iz, (bvh_box[node, 5] - pz) * iz
+        t0, t1 = max(t0, min(ta, tb)), min(t1, max(ta, tb))
         if t0 > t1:
             continue
         left, count = bvh_link[node, 0], bvh_link[node, 1]
@@ -332,12 +380,18 @@ def trace(bvh_box, bvh_link, order, kind, rot, centre, half, top, p, d, t_max, w
             continue
         for k in range(left, left + count):
             i = order[k]
-            for r in range(3):
-                o[r] = e[r] = 0.0
-                for c in range(3):
-                    o[r] += rot[i, r, c] * (p[c] - centre[i, c])
-                    e[r] += rot[i, r, c] * d[c]
-            t, f = _hit(kind[i], o, e, half[i], top[i])
+            x, y, z = px - centre[i, 0], py - centre[i, 1], pz - centre[i, 2]
+            ox, oy = (
+                rot[i, 0, 0] * x + rot[i, 0, 1] * y + rot[i, 0, 2] * z,
+                rot[i, 1, 0] * x + rot[i, 1, 1] * y + rot[i, 1, 2] * z,
+            )
+            oz = rot[i, 2, 0] * x + rot[i, 2, 1] * y + rot[i, 2, 2] * z
+            ex, ey = (
+                rot[i, 0, 0] * dx + rot[i, 0, 1] * dy + rot[i, 0, 2] * dz,
+                rot[i, 1, 0] * dx + rot[i, 1, 1] * dy + rot[i, 1, 2] * dz,
+            )
+            ez = rot[i, 2, 0] * dx + rot[i, 2, 1] * dy + rot[i, 2, 2] * dz
+            t, f = _hit(kind[i], ox, oy, oz, ex, ey, ez, half[i, 0], half[i, 1], half[i, 2], top[i])
             if t < best:
                 best, prim, face = t, i, f
     return best, prim, face
@@ -352,14 +406,16 @@ def bake(bvh_box, bvh_link, order, world, fmap, mean, lamps, dirs, reach, ambien
     `reach` metres gives less of it (ambient occlusion).
     """
     kind, rot, centre, half, top = world
-    work, n, gu, gv = np.zeros((2, 3)), np.zeros(3), np.zeros(3), np.zeros(3)
-    p, q, d, nw = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
+    stack = np.zeros(64, np.int64)
+    n, p, q, d, nw = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
     for i in range(kind.shape[0]):
         for face in range(6):
             offset, nu, nv = fmap[i, face, 0], fmap[i, face, 1], fmap[i, face, 2]
             for texel in range(nu * nv if offset >= 0 else 0):
                 _face_point(kind[i], face, (texel % nu + 0.5) / nu, (texel // nu + 0.5) / nv, half[i], top[i], p)
-                _surface(kind[i], face, p, half[i], top[i], n, gu, gv)
+                _, _, n[0], n[1], n[2], _, _, _, _, _, _ = _surface(
+                    kind[i], face, p[0], p[1], p[2], half[i, 0], half[i, 1], half[i, 2], top[i]
+                )
                 for c in range(3):
                     nw[c] = rot[i, 0, c] * n[0] + rot[i, 1, c] * n[1] + rot[i, 2, c] * n[2]
                     q[c] = centre[i, c] + 2e-3 * nw[c]
@@ -375,7 +431,24 @@ def bake(bvh_box, bvh_link, order, world, fmap, mean, lamps, dirs, reach, ambien
                     cos_lamp = -(lamps[k, 3] * d[0] + lamps[k, 4] * d[1] + lamps[k, 5] * d[2]) / math.sqrt(dist2)
                     if cos_here <= 0 or cos_lamp <= 0:
                         continue
-                    _, blocker, _ = trace(bvh_box, bvh_link, order, kind, rot, centre, half, top, q, d, 0.995, work)
+                    _, blocker, _ = trace(
+                        bvh_box,
+                        bvh_link,
+                        order,
+                        kind,
+                        rot,
+                        centre,
+                        half,
+                        top,
+                        q[0],
+                        q[1],
+                        q[2],
+                        d[0],
+                        d[1],
+                        d[2],
+                        0.995,
+                        stack,
+                    )
                     if blocker < 0:
                         for c in range(3):
                             light[c] += lamps[k, 6 + c] * cos_here * cos_lamp / (dist2 + 0.3)
@@ -388,7 +461,24 @@ def bake(bvh_box, bvh_link, order, world, fmap, mean, lamps, dirs, reach, ambien
                     d[0] = dirs[k, 0] * bx + dirs[k, 1] * cx + dirs[k, 2] * nw[0]
                     d[1] = dirs[k, 0] * by + dirs[k, 1] * cy + dirs[k, 2] * nw[1]
                     d[2] = dirs[k, 0] * bz + dirs[k, 1] * cz + dirs[k, 2] * nw[2]
-                    t, hit, f = trace(bvh_box, bvh_link, order, kind, rot, centre, half, top, q, d, FAR, work)
+                    t, hit, f = trace(
+                        bvh_box,
+                        bvh_link,
+                        order,
+                        kind,
+                        rot,
+                        centre,
+                        half,
+                        top,
+                        q[0],
+                        q[1],
+                        q[2],
+                        d[0],
+                        d[1],
+                        d[2],
+                        FAR,
+                        stack,
+                    )
                     if hit >= 0:
                         near = min(t / reach, 1.0)
                         for c in range(3):
@@ -418,6 +508,3 @@ def _face_point(kind, face, u, v, half, top, p):  # type: ignore[no-untyped-def]
         else:
             s = math.sqrt(max(1 - (1 - 2 * v) ** 2, 0.0))
             p[0], p[1], p[2] = half[0] * s * math.cos(angle), half[1] * s * math.sin(angle), z
-
-
-Kernel = Any  # numba's dispatchers carry no types

@@ -18,7 +18,9 @@ def letter(image: Float32Array, k: int, x: float, y: float, w: float, h: float, 
     cv2.polylines(image, [np.rint(points).astype(np.int32)], False, colour, thickness)
 
 
-def write(rng: Rng, image: Float32Array, x: int, y: int, width: int, height: int, colour: Colour, words: int = 1) -> None:
+def write(
+    rng: Rng, image: Float32Array, x: int, y: int, width: int, height: int, colour: Colour, words: int = 1
+) -> None:
     """Writes made-up words in a box of `image`, in place."""
     lengths = rng.integers(3, 9, words)
     step = min(width / (int(lengths.sum()) + words - 1), 0.7 * height)
@@ -37,14 +39,17 @@ def _blank(colour: Colour, height: int, width: int) -> Float32Array:
 
 def landscape(rng: Rng, height: int = 512, width: int = 512) -> ImageArray:
     """Sky with clouds and sun, ridges one behind the other, trees and houses."""
-    top, low = np.asarray(random_colour(rng, 90, 230)), np.asarray(random_colour(rng, 130, 250))
+    skies = (((96, 146, 206), (206, 222, 236)), ((120, 110, 150), (242, 190, 140)), ((150, 170, 186), (226, 228, 226)))
+    chosen = skies[int(rng.integers(len(skies)))]
+    top, low = np.asarray(chosen[0]) + rng.uniform(-15, 15, 3), np.asarray(chosen[1]) + rng.uniform(-12, 12, 3)
     y = np.linspace(0, 1, height, dtype=np.float32)[:, None, None]
     image = np.broadcast_to((1 - y) * top + y * low, (height, width, 3)).astype(np.float32)
     image = np.ascontiguousarray(image + 24 * np.maximum(noise(rng, height, width, (4, 3), 6), 0)[..., None])
     cv2.circle(
         image, (int(rng.integers(width)), int(height * rng.uniform(0.1, 0.3))), 34, (250, 240, 190), -1, cv2.LINE_AA
     )
-    ground = np.asarray(random_colour(rng, 40, 150))
+    grounds = ((86, 118, 70), (128, 116, 78), (96, 104, 110), (150, 130, 96))
+    ground = np.asarray(grounds[int(rng.integers(len(grounds)))]) + rng.uniform(-14, 14, 3)
     rough = noise(rng, height, width, (24, 24), 5, 0.8)
     for k in range(5):
         line = height * (0.35 + 0.13 * k) + 0.07 * height * noise(rng, 1, width, (1, 3 + k), 6)[0]
@@ -60,7 +65,7 @@ def landscape(rng: Rng, height: int = 512, width: int = 512) -> ImageArray:
 def _tree_or_house(rng: Rng, image: Float32Array, x: int, y: int, s: int, k: int) -> None:
     s = max(s, 4)
     if rng.random() < 0.3:
-        wall = random_colour(rng, 120, 240)
+        wall = random_colour(rng, 150, 240, 0.4)
         cv2.rectangle(image, (x - s, y - s), (x + s, y + s // 2), wall, -1)
         roof = np.array([[x - s - 3, y - s], [x, y - 2 * s], [x + s + 3, y - s]], np.int32)
         cv2.fillPoly(image, [roof], shift(random_colour(rng, 60, 180), 0.8), cv2.LINE_AA)
@@ -77,10 +82,14 @@ def _tree_or_house(rng: Rng, image: Float32Array, x: int, y: int, s: int, k: int
 
 def abstract(rng: Rng, height: int = 512, width: int = 512) -> ImageArray:
     """Overlapping polygons, discs and strokes."""
-    image = _blank(random_colour(rng, 120, 240), height, width)
+    image = _blank(random_colour(rng, 150, 240, 0.4), height, width)
+    tones = [random_colour(rng, 20, 240) for _ in range(6)]
     for _ in range(int(rng.integers(35, 75))):
         at = np.array([rng.integers(width), rng.integers(height)])
-        size, colour = int(height * rng.uniform(0.02, 0.22)), random_colour(rng, 20, 245)
+        size, colour = (
+            int(height * rng.uniform(0.02, 0.22)),
+            shift(tones[int(rng.integers(6))], float(rng.uniform(0.8, 1.2))),
+        )
         style = rng.random()
         if style < 0.4:
             corners = (at + rng.integers(-size, size + 1, (int(rng.integers(3, 6)), 2))).astype(np.int32)
@@ -237,7 +246,13 @@ def door_of_fridge(rng: Rng, height: int = 1024, width: int = 512) -> ImageArray
 
 
 def panelled(
-    rng: Rng, colour: Colour, height: int = 1024, width: int = 512, rows: int = 2, cols: int = 2
+    rng: Rng,
+    colour: Colour,
+    height: int = 1024,
+    width: int = 512,
+    rows: int = 2,
+    cols: int = 2,
+    knobs: bool = True,
 ) -> ImageArray:
     """A door or a cupboard's front: framed panels in painted wood."""
     grain = noise(rng, height, width, (4, 48), 4, 0.8)
@@ -248,7 +263,8 @@ def panelled(
             y0, y1 = int((r + 0.1) * height / rows), int((r + 0.9) * height / rows)
             cv2.rectangle(image, (x0, y0), (x1, y1), shift(colour, 0.7), 5)
             cv2.rectangle(image, (x0 + 9, y0 + 9), (x1 - 9, y1 - 9), shift(colour, 1.12), 3)
-            cv2.circle(image, (x1 - 18, (y0 + y1) // 2), 9, (90, 80, 60), -1, cv2.LINE_AA)
+            if knobs:
+                cv2.circle(image, (x1 - 18, (y0 + y1) // 2), 9, (90, 80, 60), -1, cv2.LINE_AA)
     return to_image(image)
 
 

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from semdb.recordings.synthetic.scene import Int64Array, PackedScene
-from semdb.types import BoolArray, Camera, Float32Array, FloatArray, ImageArray
+from semdb.types import Camera, Float32Array, FloatArray, ImageArray
 
 AMBIENT_REACH = 0.9  # metres: nearer surfaces take away ambient light
-DIRECTIONS = 48
+DIRECTIONS = 32
 LEAF = 4  # primitives
 _EXPOSURE = 1.0
 
@@ -79,7 +78,7 @@ def bake_light(scene: PackedScene, lamps: list[Lamp]) -> PackedScene:
     """`scene` with the light of `lamps`, their soft shadows and ambient occlusion. Depends on nothing that moves."""
     from semdb.recordings.synthetic import kernels
 
-    boxes, links, order = _hierarchy(scene.box_low, scene.box_high)
+    boxes, links, order = _hierarchy(scene.corners.min(axis=1), scene.corners.max(axis=1))
     light = np.zeros(scene.light.shape, np.float64)
     world = (scene.kind, scene.rotation, scene.centre, scene.half, scene.top)
     mean = np.minimum(scene.mean, 1.0)
@@ -93,22 +92,27 @@ def bake_light(scene: PackedScene, lamps: list[Lamp]) -> PackedScene:
 
 
 def _cull(scene: PackedScene, camera: Camera, pose: FloatArray, tile: int) -> tuple[Int64Array, Int64Array, FloatArray]:
-    """Which primitives each tile of the image may show: ranges ``[rows, cols, 2]`` in ids, sorted by least depth."""
-    corners = np.stack([np.where(k, scene.box_high, scene.box_low) for k in _CORNERS], axis=1)  # [n, 8, 3]
-    local = (corners - pose[:3, 3]) @ pose[:3, :3]
+    """Which primitives each tile of the image may show: ranges ``[rows, cols, 2]`` in ids, sorted by least depth.
+
+    The third array ``[n, 5]`` holds least depth and the bounds of the rays, x0, x1, y0, y1, that can hit a primitive.
+    """
+    local = (scene.corners - pose[:3, 3]) @ pose[:3, :3]
     z = local[..., 2]
-    near = z.min(axis=1)
     rows, cols = -(-camera.height // tile), -(-camera.width // tile)
-    crosses = near < 0.02
     zs = np.maximum(z, 0.02)
-    u, v = camera.fx * local[..., 0] / zs + camera.cx, camera.fy * local[..., 1] / zs + camera.cy
-    u0, u1 = np.where(crosses, 0, u.min(axis=1) - 1), np.where(crosses, camera.width, u.max(axis=1) + 1)
-    v0, v1 = np.where(crosses, 0, v.min(axis=1) - 1), np.where(crosses, camera.height, v.max(axis=1) + 1)
-    seen = (z.max(axis=1) > 0) & (u1 >= 0) & (v1 >= 0) & (u0 <= camera.width) & (v0 <= camera.height)
-    c0, c1 = np.clip(u0 // tile, 0, cols - 1), np.clip(u1 // tile, 0, cols - 1)
-    r0, r1 = np.clip(v0 // tile, 0, rows - 1), np.clip(v1 // tile, 0, rows - 1)
-    near = np.maximum(near, 0.0)
-    order = np.flatnonzero(seen)[np.argsort(near[seen], kind="stable")]
+    crosses = (z.min(axis=1) < 0.02)[:, None]
+    low = np.where(crosses, -np.inf, (local[..., :2] / zs[..., None]).min(axis=1))  # x, y of rays
+    high = np.where(crosses, np.inf, (local[..., :2] / zs[..., None]).max(axis=1))
+    margin = 1e-6
+    near = np.column_stack([np.maximum(z.min(axis=1), 0), low[:, 0], high[:, 0], low[:, 1], high[:, 1]])
+    near[:, [1, 3]] -= margin
+    near[:, [2, 4]] += margin
+    size = np.array([camera.width, camera.height])
+    lens, middle = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+    first, last = np.clip(low * lens + middle - 1, -1, size), np.clip(high * lens + middle + 1, -1, size)
+    seen = (z.max(axis=1) > 0) & (last >= 0).all(axis=1) & (first < size).all(axis=1)
+    (c0, r0), (c1, r1) = (np.clip(e // tile, 0, [cols - 1, rows - 1]).T for e in (first, last))
+    order = np.flatnonzero(seen)[np.argsort(near[seen, 0], kind="stable")]
     grid = np.zeros((rows, cols, len(order)), np.bool_)
     for k, i in enumerate(order):
         grid[int(r0[i]) : int(r1[i]) + 1, int(c0[i]) : int(c1[i]) + 1, k] = True
@@ -117,9 +121,6 @@ def _cull(scene: PackedScene, camera: Camera, pose: FloatArray, tile: int) -> tu
     tiles = np.stack([stop - counts, stop], axis=2).astype(np.int64)
     ids = np.broadcast_to(order, grid.shape)[grid].astype(np.int64)
     return tiles, ids, near
-
-
-_CORNERS: list[BoolArray] = [np.array([k & 1, k & 2, k & 4]) > 0 for k in range(8)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,12 +139,13 @@ def render_view(scene: PackedScene, camera: Camera, world_from_camera: FloatArra
     tiles, ids, near = _cull(scene, camera, world_from_camera, kernels.TILE)
     origin = np.einsum("nij,nj->ni", scene.rotation, world_from_camera[:3, 3] - scene.centre)
     turn = np.ascontiguousarray(scene.rotation @ world_from_camera[:3, :3])
-    arrays: tuple[Any, ...] = (scene.kind, scene.half, scene.top, scene.texture, scene.uv, scene.light_map, scene.tint)
-    arrays = (*arrays, scene.texels, scene.table, scene.light)
     rgb = np.zeros((camera.height, camera.width, 3), np.uint8)
     depth = np.zeros((camera.height, camera.width))
     prims = np.full((camera.height, camera.width), -1, np.int32)
-    lens = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
-    kernels.render(arrays, tiles, ids, origin, turn, near, lens, rgb, depth, prims)
+    solids = (scene.kind, scene.half, scene.top)
+    looks = (scene.texture, scene.uv, scene.light_map, scene.tint, scene.texels, scene.table, scene.light)
+    view = (tiles, ids, origin, turn, near, float(camera.fx), float(camera.cx), float(camera.cy), depth, prims)
+    kernels.cast(*solids, *view)
+    kernels.shade(*solids, *looks, *view, rgb)
     labels = np.where(prims >= 0, scene.label[np.maximum(prims, 0) // 8], 0).astype(np.uint16)
     return View(rgb, depth.astype(np.float32), labels)

@@ -28,7 +28,9 @@ class Room:
     items: list[Item] = field(default_factory=list)
     solid: list[Rect] = field(default_factory=list)  # footprints
     wall_use: list[tuple[int, float, float, float, float]] = field(default_factory=list)  # wall, s0, s1, z0, z1
-    windows: list[tuple[FloatArray, float, float]] = field(default_factory=list)  # pose (y into the room), width, height
+    windows: list[tuple[FloatArray, float, float]] = field(
+        default_factory=list
+    )  # pose (y into the room), width, height
 
     def classes(self) -> dict[int, str]:
         """Category of each label."""
@@ -88,7 +90,7 @@ def build_room(room_seed: int) -> Room:
 def _shell(room: Room, p: Palette, rng: Rng) -> None:
     """Floor, ceiling and four walls: wallpaper or bricks on some, paint on the others; a skirting board and a rug."""
     w, d, h = room.size
-    tone = [textures.shift(textures.random_colour(rng, 165, 235), 1.0) for _ in range(3)]
+    tone = [textures.wall_colour(rng) for _ in range(3)]
     plain = [Material(Texture(textures.plaster(rng, tone[k]), wrap=False)) for k in range(2)]
     accent = textures.bricks(rng, (172, 96, 74)) if rng.random() < 0.3 else textures.wallpaper(rng, tone[2])
     paper = Material(Texture(accent, wrap=False))
@@ -98,9 +100,11 @@ def _shell(room: Room, p: Palette, rng: Rng) -> None:
     if style < 0.6:
         floor = textures.planks(rng, ((150, 104, 66), (188, 148, 104), (112, 76, 52))[int(rng.integers(3))])
     elif style < 0.8:
-        floor = textures.tiles(rng, textures.random_colour(rng, 120, 210))
+        floor = textures.tiles(rng, textures.shift(textures.wall_colour(rng), 0.8))
     else:
-        floor = np.tile(textures.fabric(rng, textures.random_colour(rng, 70, 170), "dots", 1024), (2, 2, 1))
+        floor = np.tile(
+            textures.fabric(rng, textures.shift(textures.cloth_colour(rng), 1.1), "leaves", 2048), (1, 1, 1)
+        )
     ceiling = Material(Texture(textures.speckle(rng, (236, 234, 228), 0.012, 512)), metres=2.0)
     faces = (*(walls[k] for k in order), ceiling, Material(Texture(floor, wrap=False)))
     room.add(None, [Prim(ROOM, yaw_pose(0, 0, h / 2), (w / 2, d / 2, h / 2), 0.0, faces)], np.eye(4))
@@ -120,7 +124,7 @@ def _shell(room: Room, p: Palette, rng: Rng) -> None:
 
 def _door_and_windows(room: Room, p: Palette, rng: Rng) -> None:
     walls = rng.permutation(4)
-    door = p.once(lambda r: pictures.panelled(r, textures.random_colour(r, 120, 215), rows=3))
+    door = p.once(lambda r: pictures.panelled(r, textures.wall_colour(r), rows=3, knobs=False))
     s = float(rng.uniform(-0.25, 0.25) * room.wall_length(walls[0]))
     pose = room.along_wall(int(walls[0]), s)
     frame = box((0, 0.02, 0), (1.0, 0.04, 2.08), p.white)
@@ -163,7 +167,9 @@ def _dining(room: Room, p: Palette, rng: Rng, corner: np.ndarray) -> None:
     for k in order:
         cx, cy, yaw = sides[k]
         out = float(rng.uniform(0.02, 0.2))
-        at = pose @ yaw_pose(cx + out * np.sign(cx) * (k > 3), cy + out * np.sign(cy), 0, yaw + np.pi + rng.uniform(-0.2, 0.2))
+        at = pose @ yaw_pose(
+            cx + out * np.sign(cx) * (k > 3), cy + out * np.sign(cy), 0, yaw + np.pi + rng.uniform(-0.2, 0.2)
+        )
         room.add("chair", furniture.chair(p, wood, seat[int(rng.random() < 0.25)]), at, 0.3)
         room.solid.append((at[0, 3] - 0.25, at[1, 3] - 0.25, at[0, 3] + 0.25, at[1, 3] + 0.25))
     spot = Spot(pose @ yaw_pose(0, 0, 0.75), (long / 2 - 0.05, across / 2 - 0.05))
@@ -218,7 +224,9 @@ def _place(room: Room, p: Palette, rng: Rng, kind: Kind) -> None:
         rect = rect_of(pose, width, kind.depth)
         if any(overlaps(rect, other, 0.05) for other in room.solid) or _disc_overlaps(rect, room.clear, 1.05):
             continue
-        if any(u[0] == wall and s - width / 2 < u[2] and u[1] < s + width / 2 and kind.height > u[3] for u in room.wall_use):
+        if any(
+            u[0] == wall and s - width / 2 < u[2] and u[1] < s + width / 2 and kind.height > u[3] for u in room.wall_use
+        ):
             continue
         kind.build(room, p, rng, pose, width)
         room.solid.append(rect)
@@ -239,15 +247,22 @@ def _on_walls(room: Room, p: Palette, rng: Rng) -> None:
             limit = room.wall_length(wall) / 2 - w / 2 - 0.15
             s = float(rng.uniform(-limit, limit))
             use = (wall, s - w / 2 - 0.1, s + w / 2 + 0.1, z - h / 2 - 0.06, z + h / 2 + 0.06)
-            if any(u[0] == wall and u[1] < use[2] and use[1] < u[2] and u[3] < use[4] and use[3] < u[4] for u in room.wall_use):
+            if any(
+                u[0] == wall and u[1] < use[2] and use[1] < u[2] and u[3] < use[4] and use[3] < u[4]
+                for u in room.wall_use
+            ):
                 continue
             room.wall_use.append(use)
             pose = room.along_wall(wall, s, 0.0, z)
-            room.add("clock" if is_clock else None, furniture.clock(p) if is_clock else furniture.picture(p, w, h), pose)
+            room.add(
+                "clock" if is_clock else None, furniture.clock(p) if is_clock else furniture.picture(p, w, h), pose
+            )
             break
 
 
-def _simple(category: str, make: Callable[[Palette], list[Prim]]) -> Callable[[Room, Palette, Rng, FloatArray, float], None]:
+def _simple(
+    category: str, make: Callable[[Palette], list[Prim]]
+) -> Callable[[Room, Palette, Rng, FloatArray, float], None]:
     """Furniture that is one object and bears nothing."""
 
     def build(room: Room, p: Palette, rng: Rng, pose: FloatArray, width: float) -> None:
@@ -282,13 +297,15 @@ def _bed(room: Room, p: Palette, rng: Rng, pose: FloatArray, width: float) -> No
 
 
 def _tv_corner(room: Room, p: Palette, rng: Rng, pose: FloatArray, width: float) -> None:
-    front = p.once(lambda r: pictures.panelled(r, textures.random_colour(r, 90, 210), 256, 512, 1, 3))
+    front = p.once(lambda r: pictures.panelled(r, textures.cloth_colour(r), 256, 512, 1, 3))
     room.add(None, furniture.cabinet(p, width, 0.42, 0.5, p.pick(p.wood), front), pose)
     spot = Spot(pose @ yaw_pose(0, 0.21, 0.5), (width / 2 - 0.02, 0.18))
     tv = room.add("tv", furniture.tv(p, float(rng.uniform(0.8, 1.05))), spot.pose @ yaw_pose(0, -0.02, 0), 0.45)
     tv.at = (0.0, 0.0)
     spot.items.append(tv)
-    scatter(room, p, rng, spot, [str(c) for c in rng.choice(["vase", "remote", "cup", "potted plant", "book"], 3, False)])
+    scatter(
+        room, p, rng, spot, [str(c) for c in rng.choice(["vase", "remote", "cup", "potted plant", "book"], 3, False)]
+    )
 
 
 def _bookcase(room: Room, p: Palette, rng: Rng, pose: FloatArray, width: float) -> None:
@@ -327,16 +344,18 @@ def _desk(room: Room, p: Palette, rng: Rng, pose: FloatArray, width: float) -> N
 
 
 def _counter(room: Room, p: Palette, rng: Rng, pose: FloatArray, width: float) -> None:
-    front = p.once(lambda r: pictures.panelled(r, textures.random_colour(r, 120, 225), 512, 512, 1, 2))
+    front = p.once(lambda r: pictures.panelled(r, textures.wall_colour(r), 512, 512, 1, 2))
     room.add(None, furniture.cabinet(p, width, 0.58, 0.9, p.white, front), pose)
     spot = Spot(pose @ yaw_pose(0, 0.29, 0.9), (width / 2 - 0.03, 0.24))
     wanted = [c for c in ("microwave", "toaster") if rng.random() < 0.65]
-    wanted += [str(c) for c in rng.choice(["bottle", "bottle", "cup", "bowl", "wine glass", "banana", "orange"], 4, False)]
+    wanted += [
+        str(c) for c in rng.choice(["bottle", "bottle", "cup", "bowl", "wine glass", "banana", "orange"], 4, False)
+    ]
     scatter(room, p, rng, spot, wanted)
 
 
 def _sideboard(room: Room, p: Palette, rng: Rng, pose: FloatArray, width: float) -> None:
-    front = p.once(lambda r: pictures.panelled(r, textures.random_colour(r, 80, 200), 512, 512, 2, 2))
+    front = p.once(lambda r: pictures.panelled(r, textures.cloth_colour(r), 512, 512, 2, 2))
     room.add(None, furniture.cabinet(p, width, 0.42, 0.82, p.pick(p.wood), front), pose)
     spot = Spot(pose @ yaw_pose(0, 0.21, 0.82), (width / 2 - 0.02, 0.17))
     wanted = ["vase", "bowl", "bottle", "book", "wine glass", "potted plant", "cup", "teddy bear"]
@@ -364,7 +383,9 @@ _FURNITURE = (
     Kind(_sideboard, (1.0, 1.4), 0.44, 0.84, 0.7),
     Kind(_plant, (0.55, 0.55), 0.55, 0.9, 0.7),
     Kind(_plant, (0.55, 0.55), 0.55, 0.9, 0.4),
-    Kind(lambda r, p, g, q, w: r.add("bench", furniture.bench(p, p.pick(p.wood)), q, 0.6), (1.22, 1.22), 0.4, 0.5, 0.35),
+    Kind(
+        lambda r, p, g, q, w: r.add("bench", furniture.bench(p, p.pick(p.wood)), q, 0.6), (1.22, 1.22), 0.4, 0.5, 0.35
+    ),
     Kind(_lamp, (0.44, 0.44), 0.44, 1.6, 0.5),
     Kind(_centred("suitcase", furniture.suitcase, 0.34), (0.52, 0.52), 0.34, 0.7, 0.4),
     Kind(_centred("backpack", furniture.backpack, 0.36), (0.4, 0.4), 0.36, 0.5, 0.4),

@@ -14,7 +14,7 @@ from semdb.types import Float32Array, FloatArray, ImageArray
 
 BOX, FRUSTUM, ELLIPSOID, ROOM = 0, 1, 2, 3  # as in kernels.py, which imports numba and is loaded only to render
 MAX_LEVELS = 12
-TEXEL = 0.06  # metres per texel of baked light
+TEXEL = 0.08  # metres per texel of baked light
 Int64Array = npt.NDArray[np.int64]
 
 
@@ -110,7 +110,9 @@ def cylinder(
     return Prim(FRUSTUM, pose_from(rotation, centre), (radius, radius, height / 2), top, faces)
 
 
-def ball(centre: Sequence[float], radii: Sequence[float], material: Material, turn: Sequence[float] = (0, 0, 0)) -> Prim:
+def ball(
+    centre: Sequence[float], radii: Sequence[float], material: Material, turn: Sequence[float] = (0, 0, 0)
+) -> Prim:
     """An ellipsoid."""
     pose = pose_from(so3_exp(turn), np.asarray(centre, np.float64))
     return Prim(ELLIPSOID, pose, (radii[0], radii[1], radii[2]), 0.0, (material,) * 6)
@@ -126,8 +128,7 @@ class PackedScene:
     half: FloatArray  # [n, 3]
     top: FloatArray  # [n]
     label: npt.NDArray[np.uint16]  # [n]
-    box_low: FloatArray  # [n, 3] world
-    box_high: FloatArray  # [n, 3]
+    corners: FloatArray  # [n, 8, 3] world, of the tightest box
     texture: Int64Array  # [n, 6]
     uv: FloatArray  # [n, 6, 4]
     light_map: Int64Array  # [n, 6, 3] offset (-1: emissive), columns, rows
@@ -167,19 +168,18 @@ def _pack_textures(textures: list[Texture]) -> tuple[ImageArray, Int64Array]:
             offset += image.size
             if level + 1 < levels:
                 image = np.asarray(
-                    cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA), np.uint8
+                    cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA),
+                    np.uint8,
                 ).reshape(image.shape[0] // 2, image.shape[1] // 2, 3)
     return np.concatenate(parts), table
 
 
-def _bounds(prim: Prim, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Axis-aligned box in the world."""
+def _corners(prim: Prim, pose: FloatArray) -> FloatArray:
+    """World corners ``[8, 3]`` of the box about a primitive."""
     half = np.asarray(prim.half, np.float64)
     if prim.kind == FRUSTUM:
         half = np.array([max(half[0], prim.top)] * 2 + [half[2]])
-    corners = np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]) * half
-    world = transform_points(pose, corners)
-    return world.min(axis=0), world.max(axis=0)
+    return transform_points(pose, np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]) * half)
 
 
 def pack(items: Sequence[Item]) -> PackedScene:
@@ -207,14 +207,13 @@ def pack(items: Sequence[Item]) -> PackedScene:
             if material.emissive:
                 mean[i, f] = 1.0
                 continue
-            size = TEXEL if max(w, h) > 0.3 else TEXEL / 2
+            size = TEXEL if max(w, h) > 0.4 else TEXEL / 2
             columns, rows = int(np.clip(w / size, 2, 128)), int(np.clip(h / size, 2, 128))
             light_map[i, f] = offset, columns, rows
             offset += columns * rows
     texels, table = _pack_textures(textures)
     averages = np.array([t.image.reshape(-1, 3).mean(axis=0) / 255 for t in textures])
     mean = np.where(mean > 0, mean, averages[index] * tint) ** 2.2  # linear light
-    bounds = [_bounds(prim, pose) for prim, pose, _ in prims]
     return PackedScene(
         kind=np.array([p.kind for p, _, _ in prims], np.int64),
         rotation=np.array([pose[:3, :3].T for _, pose, _ in prims]),
@@ -222,8 +221,7 @@ def pack(items: Sequence[Item]) -> PackedScene:
         half=np.array([p.half for p, _, _ in prims], np.float64),
         top=np.array([p.top for p, _, _ in prims], np.float64),
         label=np.array([label for _, _, label in prims], np.uint16),
-        box_low=np.array([b[0] for b in bounds]),
-        box_high=np.array([b[1] for b in bounds]),
+        corners=np.array([_corners(prim, pose) for prim, pose, _ in prims]),
         texture=index,
         uv=uv,
         light_map=light_map,

@@ -81,7 +81,9 @@ def make_small(p: Palette, category: str) -> list[Prim]:
 def _banana(p: Palette) -> list[Prim]:
     skin = Material(Texture(speckle(p.rng, (220, 186, 60), 0.12)))
     angles = np.linspace(-0.7, 0.7, 5)
-    return [ball((0.1 * np.sin(a), 0.1 * np.cos(a) - 0.08, 0.018), (0.028, 0.018, 0.018), skin, (0, 0, -a)) for a in angles]
+    return [
+        ball((0.1 * np.sin(a), 0.1 * np.cos(a) - 0.08, 0.018), (0.028, 0.018, 0.018), skin, (0, 0, -a)) for a in angles
+    ]
 
 
 def _scissors(p: Palette) -> list[Prim]:

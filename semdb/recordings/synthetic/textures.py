@@ -18,20 +18,20 @@ def noise(
 ) -> Float32Array:
     """Tileable fractal noise ``[height, width]`` with mean 0 and standard deviation 1.
 
-    `cells` are those of the coarsest octave (down, across); each octave doubles them and is `gain` times weaker.
+    `cells` are those of the coarsest octave (down, across), rounded to powers of two; each octave doubles them and is `gain` times weaker.
     """
     total = np.zeros((height, width), np.float32)
     weight = 1.0
     rows, cols = cells
     for _ in range(octaves):
-        r, c = max(int(round(rows)), 1), max(int(round(cols)), 1)
+        r, c = (2 ** max(round(np.log2(n)), 0) for n in (rows, cols))
         if r > height or c > width:
             break
+        # cells are powers of two as are the sides, so a border of 2 cells comes out as whole pixels to cut off
         grid = np.pad(rng.random((r, c), dtype=np.float32), 2, mode="wrap")
-        y = ((np.arange(height, dtype=np.float32) + 0.5) * (r / height) + 1.5)[:, None]
-        x = ((np.arange(width, dtype=np.float32) + 0.5) * (c / width) + 1.5)[None, :]
-        map_x, map_y = np.broadcast_to(x, (height, width)), np.broadcast_to(y, (height, width))
-        total += weight * cv2.remap(grid, map_x.copy(), map_y.copy(), cv2.INTER_CUBIC)
+        dy, dx = height // r, width // c
+        big = cv2.resize(grid, ((c + 4) * dx, (r + 4) * dy), interpolation=cv2.INTER_CUBIC)
+        total += weight * big[2 * dy : 2 * dy + height, 2 * dx : 2 * dx + width]
         weight *= gain
         rows, cols = rows * 2, cols * 2
     return np.asarray((total - total.mean()) / max(float(total.std()), 1e-6), np.float32)
@@ -50,11 +50,33 @@ def tinted(colour: Colour, *layers: Float32Array) -> Float32Array:
     return image
 
 
-def random_colour(rng: Rng, low: float = 40, high: float = 225) -> Colour:
-    """A colour with some saturation."""
+def random_colour(rng: Rng, low: float = 40, high: float = 225, saturation: float = 0.8) -> Colour:
+    """A colour between two levels; `saturation` 0 is grey."""
     c = rng.uniform(low, high, 3)
-    c = c + 0.6 * (c - c.mean())
-    return tuple(float(x) for x in np.clip(c, low * 0.6, high))  # type: ignore[return-value]
+    c = c.mean() + saturation * (c - c.mean())
+    return float(c[0]), float(c[1]), float(c[2])
+
+
+def wall_colour(rng: Rng) -> Colour:
+    """What people paint walls and doors with: light, and close to white, cream, sage, sky or rose."""
+    tones = ((232, 226, 212), (226, 214, 190), (204, 214, 196), (198, 212, 222), (226, 204, 196), (214, 210, 204))
+    base = np.asarray(tones[int(rng.integers(len(tones)))]) + rng.uniform(-9, 9, 3)
+    return float(base[0]), float(base[1]), float(base[2])
+
+
+def cloth_colour(rng: Rng) -> Colour:
+    """Muted colours of upholstery and paintwork."""
+    tones = (
+        (96, 110, 128),
+        (150, 84, 66),
+        (88, 112, 88),
+        (176, 158, 128),
+        (112, 88, 104),
+        (66, 78, 92),
+        (182, 140, 70),
+    )
+    base = np.asarray(tones[int(rng.integers(len(tones)))]) * rng.uniform(0.85, 1.15) + rng.uniform(-12, 12, 3)
+    return float(base[0]), float(base[1]), float(base[2])
 
 
 def shift(colour: Colour, factor: float) -> Colour:
@@ -120,7 +142,7 @@ def plaster(rng: Rng, colour: Colour, height: int = 1024, width: int = 2048) -> 
 def wallpaper(rng: Rng, colour: Colour, height: int = 1024, width: int = 2048) -> ImageArray:
     """Stripes and flowers on a grid, hand-printed: no two flowers are quite alike, and the paper has aged."""
     image = tinted(colour, 0.02 * noise(rng, height, width, (64, 128), 3))
-    ink, second = shift(random_colour(rng, 50, 170), 0.9), random_colour(rng, 90, 230)
+    ink, second = shift(colour, float(rng.uniform(0.6, 0.82))), random_colour(rng, 120, 235, 0.5)
     step = int(rng.choice([64, 96, 128]))
     if rng.random() < 0.6:
         for x in range(0, width, step):
@@ -176,7 +198,7 @@ def tiles(rng: Rng, colour: Colour, size: int = 2048, count: int = 14) -> ImageA
 
 def rug(rng: Rng, height: int = 512, width: int = 1024) -> ImageArray:
     """A woven rug: borders and rows of diamonds, with uneven dye and a pile."""
-    ground, ink, third = random_colour(rng, 60, 170), random_colour(rng, 40, 220), random_colour(rng, 90, 240)
+    ground, ink, third = cloth_colour(rng), cloth_colour(rng), random_colour(rng, 150, 235, 0.4)
     image = np.ones((height, width, 3), np.float32) * np.asarray(ground, np.float32)
     for k, inset in enumerate((14, 34, 58)):
         colour = (ink, third, ink)[k]
@@ -186,7 +208,7 @@ def rug(rng: Rng, height: int = 512, width: int = 1024) -> ImageArray:
             r = int(rng.integers(16, 29))
             diamond = np.array([[x - r, y], [x, y - r], [x + r, y], [x, y + r]], np.int32)
             cv2.fillPoly(image, [diamond], shift(ink if rng.random() < 0.6 else third, float(rng.uniform(0.75, 1.2))))
-            cv2.circle(image, (x, y), max(r // 3, 2), random_colour(rng), -1)
+            cv2.circle(image, (x, y), max(r // 3, 2), cloth_colour(rng), -1)
     pile = noise(rng, height, width, (height // 4, width // 4), 2)
     return to_image(image * (1 + 0.1 * pile + 0.07 * noise(rng, height, width, (6, 12), 5))[..., None])
 
@@ -194,7 +216,7 @@ def rug(rng: Rng, height: int = 512, width: int = 1024) -> ImageArray:
 def fabric(rng: Rng, colour: Colour, pattern: str = "plain", size: int = 512) -> ImageArray:
     """Cloth with a weave; `pattern` is plain, check, dots, stripes or leaves."""
     image = np.ones((size, size, 3), np.float32) * np.asarray(colour, np.float32)
-    ink = random_colour(rng, 40, 235)
+    ink = random_colour(rng, 60, 225, 0.6)
     if pattern == "check":
         for x in range(0, size, 64):
             image[:, x : x + 26] = 0.55 * image[:, x : x + 26] + 0.45 * np.asarray(ink, np.float32)
@@ -210,7 +232,7 @@ def fabric(rng: Rng, colour: Colour, pattern: str = "plain", size: int = 512) ->
     elif pattern == "leaves":
         for _ in range(110):
             at = (int(rng.integers(0, size)), int(rng.integers(0, size)))
-            leaf = shift(ink if rng.random() < 0.7 else random_colour(rng), float(rng.uniform(0.6, 1.2)))
+            leaf = shift(ink if rng.random() < 0.7 else cloth_colour(rng), float(rng.uniform(0.6, 1.2)))
             axes = (int(rng.integers(10, 34)), int(rng.integers(3, 10)))
             cv2.ellipse(image, at, axes, float(rng.uniform(0, 180)), 0, 360, leaf, -1, cv2.LINE_AA)
     weave, fold = noise(rng, size, size, (size // 3, size // 3), 1), noise(rng, size, size, (5, 5), 5, 0.6)

@@ -26,8 +26,8 @@ def _distance_to_solid(room: Room, points: FloatArray) -> FloatArray:
 
 
 def _free_radius(room: Room, angle: float) -> float:
-    """How far one can walk from the clear centre in a direction."""
-    r = np.arange(0.0, 3.0, 0.02)
+    """How far one can walk from the clear centre in a direction, at most 1.3 m."""
+    r = np.arange(0.0, 1.3, 0.02)
     points = np.asarray(room.clear) + r[:, None] * np.array([np.cos(angle), np.sin(angle)])
     blocked = np.flatnonzero(_distance_to_solid(room, points) < CLEARANCE)
     return float(r[blocked[0]] if len(blocked) else r[-1])
@@ -42,7 +42,7 @@ def walk(room: Room, frames: int, lap_frames: int, seed: int, second_visit: bool
     rng = np.random.default_rng([seed, 3, int(second_visit)])
     laps = int(np.ceil(frames / lap_frames)) + 1
     knots = KNOTS * laps + 1
-    share = np.tile(rng.uniform(0.45, 0.95, KNOTS), laps + 1)[:knots] + rng.uniform(-0.05, 0.05, knots)
+    share = np.tile(rng.uniform(0.5, 0.85, KNOTS), laps + 1)[:knots] + rng.uniform(-0.05, 0.05, knots)
     sense = 1.0 if rng.random() < 0.5 else -1.0
     start, look = rng.uniform(0, 2 * np.pi, 2)
     angle = start + sense * 2 * np.pi * (np.arange(knots) / KNOTS) + rng.uniform(-0.12, 0.12, knots)

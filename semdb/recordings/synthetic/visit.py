@@ -20,7 +20,9 @@ def move_objects(room: Room, seed: int, room_seed: int) -> list[int]:
             continue
         if item.category == "chair":
             dx, dy = rng.uniform(-0.14, 0.14, 2)
-            item.pose = item.pose @ yaw_pose(float(dx), float(dy), 0, float(rng.uniform(0.15, 0.6) * rng.choice([-1, 1])))
+            item.pose = item.pose @ yaw_pose(
+                float(dx), float(dy), 0, float(rng.uniform(0.15, 0.6) * rng.choice([-1, 1]))
+            )
             moved.append(item.label)
         elif item.spot is not None and _move_on_spot(rng, item):
             moved.append(item.label)

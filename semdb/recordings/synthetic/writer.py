@@ -52,9 +52,9 @@ def _lamps(room: Room) -> list[Lamp]:
     """The lamp under the ceiling and the windows."""
     down = np.eye(4)
     down[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]  # its y axis points down
-    lamps = [Lamp(yaw_pose(0, 0, room.size[2] - 0.07) @ down, 1.2, 0.35, (2.3, 2.1, 1.8), (4, 2))]
+    lamps = [Lamp(yaw_pose(0, 0, room.size[2] - 0.07) @ down, 1.2, 0.35, (2.3, 2.1, 1.8), (4, 1))]
     for pose, width, height in room.windows:
-        lamps.append(Lamp(pose, width, height, (1.7, 1.9, 2.2), (3, 3)))
+        lamps.append(Lamp(pose, width, height, (1.7, 1.9, 2.2), (2, 2)))
     return lamps
 
 
