@@ -118,6 +118,51 @@ def _filter_boxes(
 
 
 @kernel
+def _dense_row(
+    flat: Any, columns: int, pad: int, size: int, i: int, start: int, n: int, strips: Any, out: Any, at: int
+) -> None:
+    """What `_filter_boxes` and `_combine` give, for the octave that samples every pixel, in half the time.
+
+    There boxes share columns: strips of rows first (`strips` int32 [3 * m]), then differences of their columns.
+    """
+    third = size // 3
+    a, e, b = (2 * size + 9) // 18, (4 * size + 9) // 18, (8 * size + 9) // 18
+    c, f, d = (10 * size + 9) // 18, (14 * size + 9) // 18, (16 * size + 9) // 18
+    weight = np.float32(1.0 / (third * (f - e)))
+    weight_xy = np.float32(1.0 / ((b - a) * (b - a)))
+    pitch = len(strips) // 3
+    origin = (i - size // 2 + pad) * columns + start - size // 2 + pad
+    zero, one, two = np.uintp(origin), np.uintp(origin + third * columns), np.uintp(origin + 2 * third * columns)
+    three, re, rf = np.uintp(origin + size * columns), np.uintp(origin + e * columns), np.uintp(origin + f * columns)
+    ra, rb = np.uintp(origin + a * columns), np.uintp(origin + b * columns)
+    rc, rd = np.uintp(origin + c * columns), np.uintp(origin + d * columns)
+    yy, xy = np.uintp(pitch), np.uintp(2 * pitch)
+    for k in range(n + size):
+        x = np.uintp(k)
+        strips[x] = np.int32(flat[rf + x] - flat[re + x])
+        middle = np.int32(flat[two + x] - flat[one + x])
+        strips[yy + x] = np.int32(np.int32(flat[three + x] - flat[zero + x]) - np.int32(np.int32(3) * middle))
+    for k in range(n + size):
+        x = np.uintp(k)
+        strips[xy + x] = np.int32(np.int32(flat[rb + x] - flat[ra + x]) - np.int32(flat[rd + x] - flat[rc + x]))
+    target = np.uintp(at)
+    x1, x2, x3 = np.uintp(third), np.uintp(2 * third), np.uintp(size)
+    ye, yf = np.uintp(pitch + e), np.uintp(pitch + f)
+    for k in range(n):
+        x = np.uintp(k)
+        middle = np.int32(strips[x2 + x] - strips[x1 + x])
+        dxx = np.float32(np.int32(np.int32(strips[x3 + x] - strips[x]) - np.int32(np.int32(3) * middle))) * weight
+        dyy = np.float32(np.int32(strips[yf + x] - strips[ye + x])) * weight
+        out[target + x] = dxx * dyy
+    xa, xb, xc, xd = np.uintp(2 * pitch + a), np.uintp(2 * pitch + b), np.uintp(2 * pitch + c), np.uintp(2 * pitch + d)
+    for k in range(n):
+        x = np.uintp(k)
+        boxes = np.int32(np.int32(strips[xb + x] - strips[xa + x]) - np.int32(strips[xd + x] - strips[xc + x]))
+        dxy = np.float32(boxes) * weight_xy
+        out[target + x] -= DXY_WEIGHT * (dxy * dxy)
+
+
+@kernel
 def _candidate_flags(
     ring: Any, here: int, above: int, below: int, smaller: int, larger: int, n: int, threshold: Any, flags: Any
 ) -> None:
@@ -198,6 +243,7 @@ def find_maxima(
     ring = np.empty((layers + 2, 3, pitch), np.float32)  # determinants of three rows
     ring_flat = ring.reshape(ring.size)
     boxes = np.empty(8 * columns, np.int32)
+    strips = np.empty(3 * (columns + (9 + 6 * (layers + 1))), np.int32)
     flags = np.zeros(columns + 16, np.uint8)
     words = flags[: (columns + 15) // 8 * 8].view(np.uint64)
     count = 0
@@ -210,9 +256,12 @@ def find_maxima(
             for k in range(len(spans)):
                 start = max(spans[k, 0] - 1, margin)
                 n = min(spans[k, 1] + 1, margin + 1 + (width - size) // step) - start
-                if n > 0:
+                target = (layer * 3 + i % 3) * pitch + start
+                if n > 0 and step == 1:
+                    _dense_row(flat, sums.shape[2], pad, size, i, start, n, strips, ring_flat, target)
+                elif n > 0:
                     weight, weight_xy = _filter_boxes(flat, step, sums.shape[2], pad, size, i, start, n, boxes)
-                    _combine(boxes, n, weight, weight_xy, ring_flat, (layer * 3 + i % 3) * pitch + start)
+                    _combine(boxes, n, weight, weight_xy, ring_flat, target)
         if i <= first:
             continue
         up, mid, down = (i - 2) % 3, (i - 1) % 3, i % 3
