@@ -66,84 +66,35 @@ class _Blocks:
     coupling: FloatArray  # [m, 6, 3]
     points: FloatArray  # [m, 3, 3]
     points_gradient: FloatArray  # [m, 3]
-    cost: float
     query_chi2: FloatArray  # [m]
-
-
-def _observe(
-    points: FloatArray, xy: FloatArray, sigma: FloatArray, depth: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """Residuals ``[n, 3]`` (x, y, depth; in sigmas, robustly weighted), Jacobian by the camera-frame point
-    ``[n, 3, 3]``, chi2 of the pixel ``[n]`` and the robust cost.
-    """
-    z = np.maximum(points[:, 2], 1e-3)
-    residual = np.zeros((len(points), 3))
-    jacobian = np.zeros((len(points), 3, 3))
-    inverse = 1 / (z * sigma)
-    residual[:, 0] = (points[:, 0] / z - xy[:, 0]) / sigma
-    residual[:, 1] = (points[:, 1] / z - xy[:, 1]) / sigma
-    jacobian[:, 0, 0] = jacobian[:, 1, 1] = inverse
-    jacobian[:, 0, 2] = -points[:, 0] / z * inverse
-    jacobian[:, 1, 2] = -points[:, 1] / z * inverse
-    measured = np.isfinite(depth)
-    spread = depth_sigma(np.where(measured, depth, 1.0))
-    residual[:, 2] = np.where(measured, (points[:, 2] - np.where(measured, depth, 0.0)) / spread, 0.0)
-    jacobian[:, 2, 2] = np.where(measured, 1 / spread, 0.0)
-    chi2 = residual[:, 0] ** 2 + residual[:, 1] ** 2
-    depth_chi2 = residual[:, 2] ** 2
-    weights = np.empty((len(points), 3))
-    weights[:, :2] = (1 / np.sqrt(1 + chi2 / CAUCHY_SQUARED))[:, None]
-    weights[:, 2] = 1 / np.sqrt(1 + depth_chi2 / CAUCHY_SQUARED)
-    cost = CAUCHY_SQUARED * float(np.log1p(chi2 / CAUCHY_SQUARED).sum() + np.log1p(depth_chi2 / CAUCHY_SQUARED).sum())
-    return residual * weights, jacobian * weights[:, :, None], chi2, cost
+    cost: float = 0.0
 
 
 def _linearise(problem: BundleProblem, pose: FloatArray, points: FloatArray) -> _Blocks:
-    rotation = pose[:3, :3]
-    in_query = points @ rotation.T + pose[:3, 3]
-    residual, by_camera, chi2, cost = _observe(in_query, problem.query_xy, problem.query_sigma, problem.query_depth)
-    by_pose = np.concatenate([by_camera, _times_minus_skew(by_camera, in_query)], axis=2)  # [m, 3, 6]
-    by_point = by_camera @ rotation
+    from semdb.localization.bundle_kernels import normal_equations
+
+    count = len(points)
     blocks = _Blocks(
-        pose=np.einsum("nri,nrj->ij", by_pose, by_pose),
-        pose_gradient=np.einsum("nri,nr->i", by_pose, residual),
-        coupling=np.swapaxes(by_pose, 1, 2) @ by_point,
-        points=np.swapaxes(by_point, 1, 2) @ by_point,
-        points_gradient=np.einsum("nri,nr->ni", by_point, residual),
-        cost=cost,
-        query_chi2=chi2,
-    )
-    _add_keyframes(problem, points, blocks)
+        np.empty((6, 6)), np.empty(6), np.empty((count, 6, 3)), np.empty((count, 3, 3)), np.empty((count, 3)),
+        np.empty(count),
+    )  # fmt: skip
+    query = np.column_stack([problem.query_xy, problem.query_sigma, problem.query_depth])
+    keyframe = np.column_stack([problem.keyframe_xy, problem.keyframe_sigma, problem.keyframe_depth])
+    blocks.cost = normal_equations(
+        pose, points, query, problem.keyframe_point, keyframe, problem.keyframe_rotation, problem.keyframe_translation,
+        CAUCHY_SQUARED, blocks.pose, blocks.pose_gradient, blocks.coupling, blocks.points, blocks.points_gradient,
+        blocks.query_chi2,
+    )  # fmt: skip
     return blocks
 
 
-def _add_keyframes(problem: BundleProblem, points: FloatArray, blocks: _Blocks) -> None:
-    index = problem.keyframe_point
-    in_keyframe = np.einsum("kij,kj->ki", problem.keyframe_rotation, points[index]) + problem.keyframe_translation
-    residual, by_camera, _, cost = _observe(
-        in_keyframe, problem.keyframe_xy, problem.keyframe_sigma, problem.keyframe_depth
-    )
-    by_point = by_camera @ problem.keyframe_rotation
-    np.add.at(blocks.points, index, np.swapaxes(by_point, 1, 2) @ by_point)
-    np.add.at(blocks.points_gradient, index, np.einsum("kri,kr->ki", by_point, residual))
-    blocks.cost += cost
+def _reduced(blocks: _Blocks, damping: float) -> tuple[FloatArray, FloatArray]:
+    """Equations ``[6, 6]`` and gradient ``[6]`` of the pose with the points eliminated."""
+    from semdb.localization.bundle_kernels import reduce_to_pose
 
-
-def _times_minus_skew(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
-    """``matrices[n] @ -skew(vectors[n])``: each row r becomes cross(v, r)."""
-    return np.cross(vectors[:, None, :], matrices)
-
-
-def _solve(blocks: _Blocks, damping: float) -> tuple[FloatArray, FloatArray]:
-    """Steps of pose ``[6]`` and points ``[m, 3]`` from the damped normal equations by the Schur complement."""
-    damped_points = blocks.points * (1 + damping * np.eye(3)) + 1e-12 * np.eye(3)
-    inverse = np.linalg.inv(damped_points)
-    carried = blocks.coupling @ inverse  # [m, 6, 3]
-    reduced = blocks.pose * (1 + damping * np.eye(6)) - np.einsum("nij,nkj->ik", carried, blocks.coupling)
-    gradient = blocks.pose_gradient - np.einsum("nij,nj->i", carried, blocks.points_gradient)
-    pose_step = -np.linalg.solve(reduced, gradient)
-    rest = blocks.points_gradient + np.einsum("nij,i->nj", blocks.coupling, pose_step)
-    return pose_step, -np.einsum("nij,nj->ni", inverse, rest)
+    reduced, gradient = blocks.pose * (1 + damping * np.eye(6)), blocks.pose_gradient.copy()
+    reduce_to_pose(blocks.coupling, blocks.points, blocks.points_gradient, damping, reduced, gradient)
+    return reduced, gradient
 
 
 def _move(pose: FloatArray, step: FloatArray) -> FloatArray:
@@ -159,18 +110,22 @@ def adjust(problem: BundleProblem, camera_from_world: FloatArray, max_iterations
 
     Raises numpy.linalg.LinAlgError when the points do not determine the pose (fewer than three, or in a row).
     """
+    from semdb.localization.bundle_kernels import move_points
+
     pose, points, damping = camera_from_world, problem.points, 1e-4
     blocks = _linearise(problem, pose, points)
     iteration = 0
     for iteration in range(1, max_iterations + 1):  # noqa: B007
-        pose_step, point_steps = _solve(blocks, damping)
-        new_pose, new_points = _move(pose, pose_step), points + point_steps
+        reduced, gradient = _reduced(blocks, damping)
+        pose_step = np.asarray(-np.linalg.solve(reduced, gradient), np.float64)
+        new_pose = _move(pose, pose_step)
+        new_points = move_points(points, blocks.coupling, blocks.points, blocks.points_gradient, damping, pose_step)
         proposed = _linearise(problem, new_pose, new_points)
         if proposed.cost < blocks.cost:
             gain = blocks.cost - proposed.cost
             pose, points, blocks = new_pose, new_points, proposed
             damping = max(damping / 10, 1e-9)
-            if gain < 1e-6 * blocks.cost or np.abs(pose_step).max() < 1e-8:
+            if gain < 1e-5 * blocks.cost or np.abs(pose_step).max() < 1e-7:
                 break
         else:
             damping *= 10
@@ -184,8 +139,7 @@ def _covariance(blocks: _Blocks, camera_from_world: FloatArray) -> FloatArray:
 
     A step (t, w) of the camera moves its centre by -R t and turns it by -R w, R being world_from_camera.
     """
-    inverse = np.linalg.inv(blocks.points + 1e-12 * np.eye(3))
-    reduced = blocks.pose - np.einsum("nij,njk,nlk->il", blocks.coupling, inverse, blocks.coupling)
+    reduced, _ = _reduced(blocks, 0.0)
     in_camera = np.linalg.inv(reduced)
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = -camera_from_world[:3, :3].T

@@ -13,6 +13,7 @@ from enum import StrEnum
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import KDTree
 
 from semdb.types import BoolArray, Float32Array, FloatArray, IntArray
 
@@ -185,23 +186,54 @@ def match_guided(
     visible = np.flatnonzero(np.isfinite(projected_xy).all(axis=1))
     if len(query_descriptors) == 0 or len(visible) == 0:
         return _no_matches()
-    distances = squared_distances(query_descriptors, keyframe_descriptors[visible])
-    power = _ratio_power(query_descriptors.dtype)
-    offset = query_xy[:, None, :].astype(np.float32) - projected_xy[visible][None].astype(np.float32)
-    near = (offset**2).sum(axis=2) < options.guided_radius_px**2
+    i, j = _pairs_within(query_xy, projected_xy[visible], options.guided_radius_px)
+    j = visible[j].astype(np.int32)
+    same_class = (query_classes[i] == keyframe_classes[j]) & (query_classes[i] != BACKGROUND)
     if options.evidence is Evidence.OBJECTS:
-        same = query_classes[:, None] == keyframe_classes[visible][None]
-        near &= same & (query_classes[:, None] != BACKGROUND)
+        i, j, same_class = i[same_class], j[same_class], same_class[same_class]
+    distance = _paired_distances(query_descriptors, keyframe_descriptors, i, j)
+    ratio = options.guided_ratio ** _ratio_power(query_descriptors.dtype)
     ceiling = _distance_ceiling(query_descriptors.dtype, query_descriptors.shape[1])
-    limited = np.where(near, distances, np.float32(np.inf))
-    nearest, best, second = _two_nearest(limited)
-    rows = np.arange(len(limited), dtype=np.int32)
-    mutual = limited.argmin(axis=0)[nearest] == rows
-    accepted = mutual & (best < ceiling) & (best < options.guided_ratio**power * second)
-    i, j = rows[accepted], nearest[accepted]
-    columns = visible[j].astype(np.int32)
-    same_class = (query_classes[i] == keyframe_classes[columns]) & (query_classes[i] != BACKGROUND)
-    return Matches(i, columns, distances[i, j], same_class)
+    best, second = _two_least(distance, i, len(query_descriptors))
+    best_back, _ = _two_least(distance, j, len(keyframe_descriptors))
+    accepted = (
+        (distance <= best[i]) & (distance <= best_back[j]) & (distance < ceiling) & (distance < ratio * second[i])
+    )
+    order = np.flatnonzero(accepted)
+    order = order[np.lexsort((j[order], i[order]))]
+    return Matches(i[order], j[order], distance[order], same_class[order])
+
+
+def _pairs_within(first: FloatArray, second: FloatArray, radius: float) -> tuple[IntArray, IntArray]:
+    """Indexes of all pairs of points ``[n, 2]`` and ``[m, 2]`` that are at most `radius` apart."""
+    near = KDTree(first).sparse_distance_matrix(KDTree(second), radius, output_type="coo_matrix")
+    return near.row.astype(np.int32), near.col.astype(np.int32)
+
+
+def _paired_distances(
+    first: npt.NDArray[np.generic], second: npt.NDArray[np.generic], i: IntArray, j: IntArray
+) -> Float32Array:
+    """`squared_distances` of rows `i` of one with rows `j` of the other, ``[k]``."""
+    if first.dtype == np.uint8:
+        differing = np.bitwise_count(np.asarray(first[i], np.uint8) ^ np.asarray(second[j], np.uint8))
+        return np.asarray(differing.sum(axis=1), np.float32)
+    product = np.einsum("kd,kd->k", np.asarray(first[i], np.float32), np.asarray(second[j], np.float32))
+    return np.asarray(np.maximum(2 - 2 * product, 0), np.float32)
+
+
+def _two_least(values: Float32Array, groups: IntArray, count: int) -> tuple[Float32Array, Float32Array]:
+    """Least and second least of the `values` of each of `count` groups; inf where there is none."""
+    least = np.full(count, np.inf, np.float32)
+    second = np.full(count, np.inf, np.float32)
+    order = np.lexsort((values, groups))
+    sorted_groups = groups[order]
+    first = np.flatnonzero(np.diff(sorted_groups, prepend=-1) != 0)
+    least[sorted_groups[first]] = values[order[first]]
+    following = first + 1
+    following = following[following < len(order)]
+    following = following[sorted_groups[following] == sorted_groups[following - 1]]
+    second[sorted_groups[following]] = values[order[following]]
+    return least, second
 
 
 def _distance_ceiling(dtype: np.dtype[np.generic], width: int) -> float:

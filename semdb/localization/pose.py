@@ -98,7 +98,7 @@ def reprojection_px(query: View, camera_from_world: FloatArray, rows: IntArray, 
 
 
 def robust_pnp(
-    query: View, pairs: Pairs, points: FloatArray, options: PoseOptions
+    query: View, pairs: Pairs, points: FloatArray, options: PoseOptions, max_iterations: int = 10000
 ) -> tuple[FloatArray, BoolArray] | None:
     """LO-RANSAC over all pairs (PoseLib): ``camera_from_world`` and which pairs agree; None where none is found."""
     if len(pairs) < MINIMUM_PAIRS:
@@ -113,8 +113,8 @@ def robust_pnp(
     }
     ransac = {
         "max_reproj_error": options.max_reprojection_px,
-        "min_iterations": 200,
-        "max_iterations": 10000,
+        "min_iterations": min(200, max_iterations),
+        "max_iterations": max_iterations,
         "seed": 0,
     }
     pose, report = poselib.estimate_absolute_pose(pixels, points, camera, ransac, {"loss_type": "CAUCHY"})
@@ -199,7 +199,7 @@ def rival_pose(
     points = world_points_of(pairs, keyframes)
     camera_from_world = invert_pose(best.world_from_camera)
     left = reprojection_px(query, camera_from_world, pairs.query, points) >= 2 * options.max_reprojection_px
-    found = robust_pnp(query, pairs.take(left), points[left], options)
+    found = robust_pnp(query, pairs.take(left), points[left], options, max_iterations=1000)
     if found is None:
         return 0
     rival, agreeing = found
