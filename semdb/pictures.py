@@ -318,9 +318,23 @@ def _draw_caption(axes: Axes, y: float, verdict: Verdict, facts: Sequence[tuple[
     for name, value in facts:
         head = axes.text(x, y - 15, name, color=FAINT, fontsize=10.5, va="center")
         body = axes.text(x, y + 11, value, color=INK, fontsize=14, va="center")
+        room = axes.get_xlim()[1] - MARGIN - x
+        _fit(body, room)
         x = max(_right_edge(head), _right_edge(body)) + 40
 
 
 def _right_edge(text: Text) -> float:
     """Where a text ends, in pixels of the sheet (the axes are in pixels)."""
     return float(text.get_window_extent().x1)
+
+
+def _fit(text: Text, room: float) -> None:
+    """Make a text smaller, then shorter, until it is at most `room` pixels wide."""
+    width = float(text.get_window_extent().width)
+    if width <= room:
+        return
+    text.set_fontsize(max(9.5, 14 * room / width))
+    kept = text.get_text()
+    while kept and text.get_window_extent().width > room:
+        kept = kept[: int(0.97 * len(kept))].rstrip()
+        text.set_text(kept + " …")

@@ -15,7 +15,6 @@ from semdb.errors import FrameError, UsageError
 from semdb.geometry import back_project, pixels_to_normalized, pose_from, rotation_angle_deg, transform_points
 from semdb.types import Camera, Candidate, Float32Array, FloatArray, Frame, ImageArray, Localization, ModelInfo, Verdict
 
-SIFT_REFERENCE = "sift-reference"
 STAGE_TRUE_POSE = "true-pose"
 
 TRANSLATION_UNIT_M = 0.3

@@ -231,6 +231,26 @@ def test_estimate_is_in_the_colour_of_its_verdict_and_ellipse_is_enlarged() -> N
     assert (plain != pictures[Verdict.LOCALIZED]).any(axis=2).sum() > 2000
 
 
+def test_ellipse_has_the_size_and_direction_of_the_covariance() -> None:
+    keyframes = np.stack([camera_at(x, y) for x in (0.0, 4.0) for y in (0.0, 1.0)])
+    covariance = np.diag([0.04, 0.0025, 0.5, 1, 1, 1])  # 0.2 m along x, 0.05 m along y; up does not matter
+    there = camera_at(2.0, 0.5, 90)
+    without = draw_top_view(keyframes, there, size=(1000, 600))
+    picture = draw_top_view(keyframes, there, covariance=covariance, size=(1000, 600))
+    rows, columns = np.nonzero((picture != without).any(axis=2)[60:-70])
+    # 95 % radii sqrt(5.991) * sigma at 220 pixels a metre
+    assert (columns.max() - columns.min()) / 2 == pytest.approx(np.sqrt(5.991) * 0.2 * 220, abs=3)
+    assert (rows.max() - rows.min()) / 2 == pytest.approx(np.sqrt(5.991) * 0.05 * 220, abs=3)
+    assert columns.mean() == pytest.approx(500, abs=3)
+
+
+def test_a_long_reason_stays_inside_the_picture() -> None:
+    facts = [("reason", "too few pairs " * 60)]
+    picture = draw_localization(grey(), [], None, [], title="", verdict=Verdict.FAILED, facts=facts)
+    assert (picture[-60:, -MARGIN + 4 :] == 255).all()
+    assert (picture[-60:, -3 * MARGIN : -MARGIN] < 128).any()
+
+
 def test_a_map_without_keyframes_is_an_error() -> None:
     with pytest.raises(ValueError, match="at least one keyframe"):
         draw_top_view(np.empty((0, 4, 4)))
