@@ -48,7 +48,7 @@ def _gradients(sums: Any, pitch: int, pad: int, height: int, width: int, x: floa
                weights: Any, columns: Any, gx: Any, gy: Any) -> int:  # fmt: skip
     """Weighted Haar responses of size 4s on the 13x13 lattice of spacing s around (x, y), into `gx`, `gy` [169].
 
-    Returns how many of them on the disc lie fully in the image; the others are 0.
+    Returns how many there are: those on the disc, if they lie fully in the image.
     """
     size = 2 * int(np.rint(2 * s))
     if size > height or size > width:
@@ -60,17 +60,15 @@ def _gradients(sums: Any, pitch: int, pad: int, height: int, width: int, x: floa
         columns[j] = left + pad if 0 <= left <= width - size else -1
     for i in range(ACROSS):
         top = int(np.rint(y + (i - RADIUS) * s - (size - 1) * 0.5))
-        inside = 0 <= top <= height - size
+        if top < 0 or top > height - size:
+            continue
         a = (top + pad) * pitch
         b = a + half * pitch
         c = a + size * pitch
         for j in range(ACROSS):
-            k = i * ACROSS + j
-            weight = weights[k]
+            weight = weights[i * ACROSS + j]
             left = columns[j]
-            if weight == 0 or left < 0 or not inside:
-                gx[k] = 0
-                gy[k] = 0
+            if weight == 0 or left < 0:
                 continue
             ap, bp, cp = np.uintp(a + left), np.uintp(b + left), np.uintp(c + left)
             q, r = np.uintp(half), np.uintp(size)
@@ -79,19 +77,19 @@ def _gradients(sums: Any, pitch: int, pad: int, height: int, width: int, x: floa
             whole_q = np.int32(sums[cp + q] - sums[ap + q])
             whole_r = np.int32(sums[cp + r] - sums[ap + r])
             upper = np.int32(np.int32(sums[bp + r] - sums[ap + r]) - np.int32(sums[bp] - sums[ap]))
-            gx[k] = np.float32(whole_r - 2 * whole_q + whole_p) * weight
-            gy[k] = np.float32(whole_r - whole_p - 2 * upper) * weight
+            gx[found] = np.float32(whole_r - 2 * whole_q + whole_p) * weight
+            gy[found] = np.float32(whole_r - whole_p - 2 * upper) * weight
             found += 1
     return found
 
 
 @kernel
-def _sector_bins(gx: Any, gy: Any, bins: Any) -> None:
+def _sector_bins(gx: Any, gy: Any, n: int, bins: Any) -> None:
     """bins[k]: 2 (a // 5), and one more unless a % 5 == 0, for the direction of a gradient in whole degrees a.
 
     Arctangent: Abramowitz and Stegun 4.4.49, error 1e-5 rad.
     """
-    for k in range(ACROSS * ACROSS):
+    for k in range(n):
         x, y = gx[k], gy[k]
         ax, ay = abs(x), abs(y)
         steep = ay > ax
@@ -111,7 +109,7 @@ def _sector_bins(gx: Any, gy: Any, bins: Any) -> None:
 
 
 @kernel
-def _dominant_angle(gx: Any, gy: Any, bins: Any, sums: Any) -> float:
+def _dominant_angle(gx: Any, gy: Any, bins: Any, found: int, sums: Any) -> float:
     """Direction, in degrees, of the longest sum of gradients over a sector of 60 degrees, tried every 5 degrees.
 
     A sector is a run of 23 bins: running sums try all. `sums` float64 [2 * (144 + 23)] is scratch.
@@ -120,7 +118,7 @@ def _dominant_angle(gx: Any, gy: Any, bins: Any, sums: Any) -> float:
     for k in range(n):
         sums[k] = 0
         sums[n + 23 + k] = 0
-    for k in range(ACROSS * ACROSS):
+    for k in range(found):
         p = np.uintp(bins[k])
         sums[p] += gx[k]
         sums[p + np.uintp(n + 23)] += gy[k]
@@ -157,11 +155,12 @@ def orient(sums: Any, pitch: int, pad: int, height: int, width: int, candidates:
     scratch = np.empty(2 * (2 * SECTORS + 23), np.float64)
     for k in range(start, stop):
         x, y, s = candidates[k, 0], candidates[k, 1], candidates[k, 2] * 1.2 / 9.0
-        if _gradients(sums, pitch, pad, height, width, x, y, s, weights, columns, gx, gy) == 0:
+        found = _gradients(sums, pitch, pad, height, width, x, y, s, weights, columns, gx, gy)
+        if found == 0:
             angles[k] = -1
             continue
-        _sector_bins(gx, gy, bins)
-        angles[k] = _dominant_angle(gx, gy, bins, scratch)
+        _sector_bins(gx, gy, found, bins)
+        angles[k] = _dominant_angle(gx, gy, bins, found, scratch)
 
 
 @kernel
