@@ -15,11 +15,12 @@ else
   exit 1
 fi
 echo "installing from the distribution: $*"
-export DEBIAN_FRONTEND=noninteractive
 log=$(mktemp)
 trap 'rm -f "$log"' EXIT
-if ! { "${as_root[@]}" apt-get update && "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive \
-       apt-get install --yes --no-install-recommends "$@"; } >"$log" 2>&1; then
+# an old or broken list may still do: whether the packages can be installed is what counts
+"${as_root[@]}" apt-get update >"$log" 2>&1 || true
+if ! "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install --yes --no-install-recommends "$@" >>"$log" 2>&1
+then
   tail -n 20 "$log" >&2
   echo "could not install: $*" >&2
   exit 1

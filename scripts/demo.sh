@@ -16,7 +16,9 @@ export SEMDB_DATABASE_URL="sqlite:///$out/semdb.sqlite3"
 
 step() {
   echo
-  echo "\$ semdb $*"
+  printf '$ semdb'
+  for word in "$@"; do case $word in *[[:space:]]*) printf ' "%s"' "$word" ;; *) printf ' %s' "$word" ;; esac; done
+  echo
   "$semdb" "$@"
 }
 
@@ -26,9 +28,8 @@ step recording "$out/room"
 step ingest "$out/room" --map room --keyframes "$keyframes"
 step status
 
-step sql "SELECT category, COUNT(*) AS seen, COUNT(DISTINCT keyframe_id) AS keyframes,
-                 ROUND(AVG(keypoint_count)) AS keypoints
-          FROM keyframe_objects GROUP BY category ORDER BY seen DESC LIMIT 8"
+step sql "SELECT category, COUNT(*) AS seen, COUNT(DISTINCT keyframe_id) AS keyframes, ROUND(AVG(keypoints)) AS keypoints
+FROM keyframe_objects GROUP BY category ORDER BY seen DESC LIMIT 8"
 
 # images that are no keyframes, evenly spaced
 mapfile -t stored < <("$semdb" sql "SELECT frame_index FROM keyframes" --format csv | tail -n +2)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from semdb.database.store import Store
 
 command = typer.Typer(
-    help="Delete recordings, maps or keyframes with all that belongs to them.",
+    help="Delete recordings, maps or keyframes.",
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,

@@ -31,7 +31,10 @@ class Check:
 
 @settings_options(models=True)
 def command(overrides: Overrides, json: JsonFlag = False) -> None:
-    """Check versions, the database and its schema, folders and models; exit code 1 when something is wrong."""
+    """Check the installation, the database and the models.
+
+    Exit code 1 when something is wrong.
+    """
     from semdb.cli.output import print_json
 
     settings = overrides.settings()

@@ -19,7 +19,7 @@ def command(
         bool, typer.Option("--execute", help="With --accounts: create them, as the account of the database URL.")
     ] = False,
 ) -> None:
-    """Create the schema, or upgrade it; nothing happens when it is there already."""
+    """Create or upgrade the schema; nothing happens when it is there."""
     from semdb.errors import UsageError
 
     url = overrides.settings().database_url

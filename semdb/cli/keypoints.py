@@ -21,9 +21,10 @@ def command(
     keyframe: Annotated[int, typer.Argument(help="Id of the keyframe, as `semdb sql` shows it.")],
     csv: Annotated[bool, typer.Option("--csv", help="CSV with full precision instead of a table.")] = False,
 ) -> None:
-    """List the keypoints of a keyframe: object, pixel, size, angle, and the 3D point in its camera's frame (m).
+    """List the keypoints of a keyframe.
 
-    Background keypoints have no object; a keypoint without depth has no 3D point.
+    Object, pixel, size, angle, and the 3D point in metres in the camera's frame. Background keypoints have no
+    object; a keypoint without depth has no 3D point.
     """
     from semdb.cli.output import print_rows
     from semdb.database.store import open_store

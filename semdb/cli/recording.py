@@ -26,7 +26,10 @@ def command(
     ] = False,
     json: JsonFlag = False,
 ) -> None:
-    """Say what a recording is: frames, usable ones, dropped ones and why, camera, depth scale, trajectory."""
+    """Say what a recording holds and which frames cannot be used.
+
+    Every image is decoded, so that broken ones are found.
+    """
     from semdb.cli.output import print_json
     from semdb.recordings import open_recordings, parse_camera
 

@@ -22,9 +22,10 @@ def command(
     statement: Annotated[str, typer.Argument(metavar='"SELECT ..."', help="One statement that reads.")],
     fmt: Annotated[Format, typer.Option("--format", help="How rows are printed.")] = Format.TABLE,
 ) -> None:
-    """Run one read-only statement on the database; docs/sql.md has examples.
+    """Run one read-only SQL statement.
 
-    On a server it runs as the account of SEMDB_READER_URL. SEMDB_SQL_TIME_LIMIT_S ends what takes too long.
+    docs/sql.md has examples. On a server it runs as the account of SEMDB_READER_URL.
+    SEMDB_SQL_TIME_LIMIT_S ends what takes too long.
     """
     from contextlib import closing
 

@@ -30,7 +30,7 @@ def command(
     ] = False,
     json: JsonFlag = False,
 ) -> None:
-    """Show the recordings of the database: what is planned, stored and failed, and how much it is."""
+    """Show what is planned, stored and failed of each recording."""
     from semdb.cli.output import print_json
     from semdb.database.store import open_store
 
@@ -112,7 +112,10 @@ def show(store: Store, recordings: list[RecordingStatus], failed: list[FailedIte
 
 @settings_options(models=False)
 def retry(overrides: Overrides, map_name: MapName = None) -> None:
-    """Put keyframes that failed back into the plan; the next `semdb ingest` of their recording tries them again."""
+    """Put keyframes that failed back into the plan.
+
+    The next `semdb ingest` of their recording, or a worker, tries them again.
+    """
     from semdb.database.requeue import requeue_failed
     from semdb.database.store import open_store
 

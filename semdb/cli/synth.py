@@ -25,7 +25,10 @@ def command(
     ] = False,
     lap_frames: Annotated[int, typer.Option(help="Frames in which the camera turns once around.")] = 120,
 ) -> None:
-    """Render a furnished room along a smooth walk: colour, exact depth, poses and object masks in the TUM layout."""
+    """Render a furnished room as a recording.
+
+    Colour, exact depth, poses and object masks along a smooth walk, in the TUM layout.
+    """
     from semdb.cli.progress import Progress
     from semdb.recordings.synthetic import SyntheticOptions, write_synthetic_recording
 

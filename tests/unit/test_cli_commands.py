@@ -276,7 +276,7 @@ def test_sql_in_three_formats() -> None:
 def test_sql_only_reads() -> None:
     assert run("sql", "DELETE FROM keyframes", code=2).stderr.startswith("semdb: only queries can be run here")
     assert "refused" in run("sql", "WITH one AS (SELECT 1) DELETE FROM keyframes", code=1).stderr
-    assert "no such column" in run("sql", "SELECT nothing FROM keyframes", code=1).stderr
+    assert "no such column" in run("sql", "SELECT missing_column FROM keyframes", code=1).stderr
     assert run("sql", "SELECT 1", "--format", "xml", code=2).exit_code == 2
     assert stored() == {"first visit": 5, "second visit": 2}
 
