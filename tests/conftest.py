@@ -38,3 +38,11 @@ def mariadb_url(mariadb_server: TestServer) -> Iterator[str]:
     """The URL of a new, empty schema."""
     with mariadb_server.schema() as url:
         yield url
+
+
+@pytest.fixture(params=["sqlite", "mariadb"])
+def empty_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """The URL of a database without a schema, on each server in turn."""
+    if request.param == "sqlite":
+        return f"sqlite:///{tmp_path / 'semdb.sqlite3'}"
+    return str(request.getfixturevalue("mariadb_url"))

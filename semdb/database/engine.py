@@ -76,12 +76,11 @@ def _sqlite_engine(url: URL) -> Engine:
 
 def make_server_engine(url: URL, read_timeout_s: int | None = None) -> Engine:
     """An engine for a server; its URL may leave out the schema."""
-    arguments: dict[str, Any] = {"connect_timeout": CONNECT_TIMEOUT_S, "charset": "utf8mb4"}
-    if read_timeout_s is not None:
-        arguments["read_timeout"] = read_timeout_s
+    # The driver's limit for connecting ends before the greeting: one that never comes needs the limit for reading.
+    limits = {"connect_timeout": CONNECT_TIMEOUT_S, "read_timeout": CONNECT_TIMEOUT_S}
     engine = create_engine(
         url,
-        connect_args=arguments,
+        connect_args={**limits, "charset": "utf8mb4"},
         pool_pre_ping=True,
         pool_recycle=3600,
         isolation_level="REPEATABLE READ",
@@ -97,6 +96,7 @@ def make_server_engine(url: URL, read_timeout_s: int | None = None) -> Engine:
             if "wsrep_sync_wait" in variables:  # reads see what this cluster has committed
                 cursor.execute("SET SESSION wsrep_sync_wait = 1")
             record.info["max_allowed_packet"] = int(variables["max_allowed_packet"])
+        connection._read_timeout = read_timeout_s  # statements may take longer than a greeting
 
     return engine
 

@@ -1,9 +1,9 @@
 """The one place where a transaction is run, and run again when the database asks for it.
 
-Retried with back-off: deadlock (1213), lock timeout (1205), lost connection (2006, 2013), a cluster node that is
-not ready (1047), and a busy SQLite file. The work is given a fresh transaction each time, so it must not keep
-anything from an earlier attempt; all writes of semdb are idempotent, so a commit whose answer was lost is safe to
-repeat.
+Retried with back-off: deadlock (1213), lock timeout (1205), lost connection (2006, 2013; 2003 while a server that
+has answered before restarts), a cluster node that is not ready (1047), and a busy SQLite file. The work is given a
+fresh transaction each time, so it must not keep anything from an earlier attempt; all writes of semdb are idempotent,
+so a commit whose answer was lost is safe to repeat.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import random
 import time
 from collections.abc import Callable
 from typing import TypeVar
+from weakref import WeakSet
 
 from sqlalchemy import Connection, Engine
 from sqlalchemy.exc import DBAPIError, IntegrityError, SQLAlchemyError
@@ -20,12 +21,14 @@ from semdb.database.engine import WRITE, safe_url
 from semdb.errors import DatabaseError
 
 T = TypeVar("T")
+_answered: WeakSet[Engine] = WeakSet()  # engines that have had a connection
 ATTEMPTS = 8
 FIRST_DELAY_S = 0.05
 LONGEST_DELAY_S = 3.0
 RETRIED_CODES = frozenset({1213, 1205, 2006, 2013, 1047})
 # Nothing listens, no such host, access denied, no such schema: trying again does not help.
-_UNREACHABLE = {2003, 2005}
+_UNREACHABLE = {2002, 2003, 2005}
+_LOST = {2006, 2013}
 _DENIED = {1044, 1045, 1049, 1698, 1142, 1227}
 
 
@@ -43,14 +46,16 @@ def _run(engine: Engine, work: Callable[[Connection], T], *, write: bool) -> T:
     delay = FIRST_DELAY_S
     for attempt in range(1, ATTEMPTS + 1):
         try:
-            with engine.connect().execution_options(**{WRITE: write}) as connection, connection.begin():
-                return work(connection)
+            with engine.connect().execution_options(**{WRITE: write}) as connection:
+                _answered.add(engine)
+                with connection.begin():
+                    return work(connection)
         except IntegrityError as error:
             if error_code(error) != 1213:  # a certification failure may be reported on any statement
                 raise
             failure: SQLAlchemyError = error
         except DBAPIError as error:
-            if not is_transient(error):
+            if not is_transient(error, answered=engine in _answered):
                 raise explain(engine, error) from error
             failure = error
         except SQLAlchemyError as error:
@@ -68,9 +73,15 @@ def error_code(error: SQLAlchemyError) -> int | None:
     return arguments[0] if arguments and isinstance(arguments[0], int) else None
 
 
-def is_transient(error: DBAPIError) -> bool:
-    """Whether the same transaction may succeed when it is run again."""
-    if error_code(error) in RETRIED_CODES:
+def is_transient(error: DBAPIError, *, answered: bool = True) -> bool:
+    """Whether the same transaction may succeed when it is run again.
+
+    A server that cannot be reached is a wrong URL when it has never `answered`, and else one that restarts.
+    """
+    code = error_code(error)
+    if code in _UNREACHABLE or code in _LOST:
+        return answered
+    if code in RETRIED_CODES:
         return True
     # The base class names are the result codes; extended codes such as SQLITE_BUSY_SNAPSHOT start with them.
     name = getattr(error.orig, "sqlite_errorname", "") or ""
@@ -83,7 +94,7 @@ def explain(engine: Engine, error: SQLAlchemyError, attempts: int = 1) -> Databa
     reason = str(getattr(error, "orig", None) or error).splitlines()[0]
     code = error_code(error)
     name = getattr(getattr(error, "orig", None), "sqlite_errorname", "") or ""
-    if code in _UNREACHABLE:
+    if code in _UNREACHABLE or (code in _LOST and engine not in _answered):
         advice = "does not answer: check that the server runs and that host and port of SEMDB_DATABASE_URL are right"
     elif code in _DENIED:
         advice = "refuses: check user, password and schema of SEMDB_DATABASE_URL, and the account's rights"

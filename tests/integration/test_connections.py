@@ -1,0 +1,195 @@
+"""Databases that cannot be used say so, without the password, and transactions that may be repeated are."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from pathlib import Path
+
+import pymysql
+import pytest
+from sqlalchemy import Connection, text
+from sqlalchemy.exc import OperationalError
+
+import semdb.database.engine
+from semdb.database import retry, schema
+from semdb.database.engine import make_engine
+from semdb.database.store import Store, open_store
+from semdb.errors import DatabaseError, UsageError
+from tests.mariadb import TestServer
+
+
+@pytest.mark.parametrize(
+    ("url", "message"),
+    [
+        ("nonsense", "cannot be read"),
+        ("postgresql://localhost/x", "databases of the kind 'postgresql' are not supported"),
+        ("sqlite://", "in memory is not supported"),
+        ("sqlite:///:memory:", "in memory is not supported"),
+        ("mysql+pymysql://me:secret@localhost", "names no schema"),
+    ],
+)
+def test_urls_that_cannot_be_used(url: str, message: str) -> None:
+    with pytest.raises(UsageError, match=message) as caught:
+        make_engine(url)
+    assert "mysql+pymysql://" in str(caught.value)
+    assert "secret" not in str(caught.value)
+
+
+def test_a_server_that_is_not_there() -> None:
+    with socket.socket() as taken:  # bound, but nobody listens
+        taken.bind(("127.0.0.1", 0))
+        url = f"mysql+pymysql://me:secret@127.0.0.1:{taken.getsockname()[1]}/semdb"
+        with pytest.raises(DatabaseError, match=r"mysql\+pymysql://me:\*\*\*@.*does not answer: check") as caught:
+            open_store(url)
+    assert "secret" not in str(caught.value)
+
+
+def test_a_server_that_accepts_and_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(semdb.database.engine, "CONNECT_TIMEOUT_S", 1)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        began = time.monotonic()
+        with pytest.raises(DatabaseError, match="does not answer"):
+            open_store(f"mysql+pymysql://me:secret@127.0.0.1:{silent.getsockname()[1]}/semdb")
+        assert time.monotonic() - began < 30  # a limit exists, however slow the machine
+
+
+def test_a_wrong_password_and_a_wrong_schema(mariadb_server: TestServer) -> None:
+    for url in (
+        mariadb_server.admin.set(password="wrong-secret", database="mysql"),
+        mariadb_server.admin.set(database="no_such_schema"),
+    ):
+        with pytest.raises(DatabaseError, match="refuses: check user, password and schema") as caught:
+            open_store(url.render_as_string(hide_password=False))
+        assert str(url.password) not in str(caught.value)
+
+
+def test_files_that_are_no_database(tmp_path: Path) -> None:
+    (tmp_path / "text.sqlite3").write_text("this is no database, however long the text is. " * 100)
+    with pytest.raises(DatabaseError, match="is not a database"):
+        open_store(f"sqlite:///{tmp_path / 'text.sqlite3'}")
+    with pytest.raises(DatabaseError, match="cannot be opened: check that its folder exists"):
+        open_store(f"sqlite:///{tmp_path / 'missing' / 'a.sqlite3'}", create=True)
+
+
+def _lost(code: int) -> OperationalError:
+    return OperationalError("SELECT 1", {}, pymysql.err.OperationalError(code, "made up"))
+
+
+@pytest.mark.parametrize("code", sorted(retry.RETRIED_CODES))
+def test_transactions_are_repeated_when_the_server_asks(
+    store: Store, monkeypatch: pytest.MonkeyPatch, code: int
+) -> None:
+    delays: list[float] = []
+    monkeypatch.setattr(retry.time, "sleep", delays.append)
+    calls: list[int] = []
+
+    def work(connection: Connection) -> str:
+        calls.append(1)
+        connection.execute(text("INSERT INTO maps (name) VALUES ('room')"))
+        if len(calls) < 4:
+            raise _lost(code)
+        return "done"
+
+    assert retry.write(store.engine, work) == "done"
+    assert len(calls) == 4
+    assert [info.name for info in store.maps()] == ["room"]  # earlier attempts left nothing
+    assert len(delays) == 3
+    assert delays[2] > delays[0]
+
+
+def test_repeating_ends(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(retry.time, "sleep", lambda _: None)
+    calls: list[int] = []
+
+    def work(_: Connection) -> None:
+        calls.append(1)
+        raise _lost(1213)
+
+    with pytest.raises(DatabaseError, match="failed 8 times in a row"):
+        retry.write(store.engine, work)
+    assert len(calls) == retry.ATTEMPTS == 8
+
+
+def test_a_refused_statement_is_not_repeated(store: Store) -> None:
+    calls: list[int] = []
+
+    def work(connection: Connection) -> None:
+        calls.append(1)
+        connection.execute(text("SELECT id FROM nowhere"))
+
+    with pytest.raises(DatabaseError, match=r"refused a statement \(.*nowhere"):
+        retry.read(store.engine, work)
+    assert len(calls) == 1
+
+
+def test_a_deadlock_is_resolved(mariadb_url: str) -> None:
+    """Two transactions lock two rows in opposite order: the server ends one, and it is run again."""
+    schema.upgrade(make_engine(mariadb_url))
+    with open_store(mariadb_url) as store:
+        first, second = store.ensure_map("a"), store.ensure_map("b")
+        barrier = threading.Barrier(2, timeout=10)
+        calls: list[int] = []
+        failures: list[Exception] = []
+
+        def cross(one: int, other: int) -> None:
+            def work(connection: Connection) -> None:
+                calls.append(1)
+                rename = text("UPDATE maps SET name = CONCAT(name, 'x') WHERE id = :id")
+                connection.execute(rename, {"id": one})
+                if len(calls) <= 2:
+                    barrier.wait()
+                connection.execute(rename, {"id": other})
+
+            try:
+                retry.write(store.engine, work)
+            except Exception as error:
+                failures.append(error)
+
+        threads = [threading.Thread(target=cross, args=pair) for pair in ((first, second), (second, first))]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert failures == []
+        assert len(calls) == 3
+        assert [info.name for info in store.maps()] == ["axx", "bxx"]
+
+
+def test_a_killed_connection_is_replaced(mariadb_url: str) -> None:
+    schema.upgrade(make_engine(mariadb_url))
+    with open_store(mariadb_url) as store:
+        calls: list[int] = []
+
+        def work(connection: Connection) -> int:
+            calls.append(1)
+            if len(calls) == 1:
+                own = connection.execute(text("SELECT CONNECTION_ID()")).scalar_one()
+                with store.engine.connect() as other:
+                    other.execute(text(f"KILL {own}"))
+            return int(connection.execute(text("SELECT 42")).scalar_one())
+
+        assert retry.read(store.engine, work) == 42
+        assert len(calls) == 2
+
+
+def test_sqlite_writers_wait_for_each_other(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'a.sqlite3'}"
+    with open_store(url, create=True) as one, open_store(url) as other:
+        inside, free = threading.Event(), threading.Event()
+
+        def hold(connection: Connection) -> None:
+            connection.execute(text("INSERT INTO maps (name) VALUES ('first')"))
+            inside.set()
+            free.wait(10)
+
+        thread = threading.Thread(target=retry.write, args=(one.engine, hold))
+        thread.start()
+        inside.wait(10)
+        assert other.maps() == []  # readers see the state before, and do not wait
+        timer = threading.Timer(0.2, free.set)
+        timer.start()
+        assert other.ensure_map("second") == 2
+        thread.join()
+        assert [info.name for info in other.maps()] == ["first", "second"]

@@ -1,0 +1,136 @@
+"""The schema on every server: up from nothing, down again, up with data in it, and refused when it does not fit."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import pytest
+from alembic.autogenerate import compare_metadata
+from alembic.config import Config
+from alembic.migration import MigrationContext
+from alembic.script import ScriptDirectory
+from sqlalchemy import Engine, inspect, text
+
+import semdb.migrations
+from semdb.database import schema
+from semdb.database.engine import make_engine
+from semdb.database.records import ChangeKind
+from semdb.database.store import Store, open_store
+from semdb.database.tables import metadata
+from semdb.errors import SchemaError
+from tests.database_samples import description, fill
+from tests.integration.comparison import FRAMES, assert_same
+
+VIEWS = {"keyframe_objects", "category_counts", "recording_summary", "covisible_objects", "keypoint_counts"}
+
+
+@pytest.fixture
+def engine(empty_url: str) -> Engine:
+    return make_engine(empty_url)
+
+
+def test_revisions_are_those_of_the_scripts() -> None:
+    config = Config()
+    config.set_main_option("script_location", str(Path(str(semdb.migrations.__file__)).parent))
+    scripts = [script.revision for script in ScriptDirectory.from_config(config).walk_revisions()]
+    assert tuple(reversed(scripts)) == schema.REVISIONS
+
+
+def test_up_from_nothing_and_down_to_nothing(engine: Engine) -> None:
+    assert schema.current_revision(engine) is None
+    for _ in range(2):
+        schema.upgrade(engine)
+        assert schema.current_revision(engine) == schema.HEAD
+        assert set(inspect(engine).get_table_names()) == set(metadata.tables) | {"alembic_version"}
+        assert set(inspect(engine).get_view_names()) == VIEWS
+        schema.upgrade(engine)  # again: nothing to do
+        schema.downgrade(engine)
+        assert inspect(engine).get_table_names() == ["alembic_version"]
+        assert inspect(engine).get_view_names() == []
+        assert schema.current_revision(engine) is None
+
+
+def test_statements_and_migrations_know_the_same_tables(engine: Engine) -> None:
+    schema.upgrade(engine)
+    with engine.connect() as connection:
+        context = MigrationContext.configure(connection, opts={"compare_type": True, "compare_server_default": True})
+        assert compare_metadata(context, metadata) == []
+
+
+def test_a_database_with_data_is_upgraded(engine: Engine, empty_url: str) -> None:
+    schema.upgrade(engine)
+    with open_store(empty_url) as store:
+        map_id, _, ids = fill(store)
+    schema.downgrade(engine, "0001")
+    assert schema.current_revision(engine) == "0001"
+    assert "keyframe_changes" not in inspect(engine).get_table_names()
+    with pytest.raises(SchemaError, match=r"revision 0001, older than this semdb needs .*semdb init"):
+        open_store(empty_url)
+    schema.upgrade(engine)
+    with open_store(empty_url) as store:
+        # The keyframes are there, and the new change log knows of them.
+        for keyframe, index in zip(store.load_keyframes(ids), FRAMES, strict=True):
+            assert_same(keyframe, description(index), index)
+        changes = store.changes_since(map_id, 0)
+        assert [(change.keyframe_id, change.kind) for change in changes] == [(key, ChangeKind.ADDED) for key in ids]
+        assert len(fill(store, name="second visit")[2]) == len(FRAMES)
+
+
+def test_a_schema_that_is_too_new_is_left_alone(engine: Engine, empty_url: str) -> None:
+    schema.upgrade(engine)
+    with engine.begin() as connection:
+        connection.execute(text("UPDATE alembic_version SET version_num = '9999'"))
+    for attempt in (
+        lambda: open_store(empty_url),
+        lambda: schema.upgrade(engine),
+        lambda: schema.downgrade(engine),
+    ):
+        with pytest.raises(SchemaError, match=r"revision 9999, which this semdb does not know .*upgrade semdb"):
+            attempt()
+    assert schema.current_revision(engine) == "9999"
+    assert "keyframes" in inspect(engine).get_table_names()
+
+
+def test_no_schema_says_what_to_run(engine: Engine, empty_url: str) -> None:
+    with engine.connect():  # makes the SQLite file
+        pass
+    with pytest.raises(SchemaError, match=r"no semdb schema in .*semdb init"):
+        open_store(empty_url)
+
+
+def test_a_sqlite_file_is_made_only_when_asked(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'new.sqlite3'}"
+    with pytest.raises(SchemaError, match=r"no database .*new\.sqlite3"):
+        open_store(url)
+    assert list(tmp_path.iterdir()) == []
+    with open_store(url, create=True) as store:
+        assert len(fill(store)[2]) == 5
+    with open_store(url) as store:
+        assert store.maps()[0].keyframes == 5
+    old = make_engine(url)
+    schema.downgrade(old, "0001")
+    old.dispose()
+    with pytest.raises(SchemaError, match="older"):  # data is upgraded by `semdb init` alone
+        open_store(url, create=True)
+
+
+def test_processes_that_make_the_same_file_do_not_disturb_each_other(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'new.sqlite3'}"
+    stores: list[Store | Exception] = []
+
+    def work() -> None:
+        try:
+            stores.append(open_store(url, create=True))
+        except Exception as error:
+            stores.append(error)
+
+    threads = [threading.Thread(target=work) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert [item for item in stores if not isinstance(item, Store)] == []
+    for item in stores:
+        assert isinstance(item, Store)
+        item.close()
