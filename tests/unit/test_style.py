@@ -54,7 +54,7 @@ def test_files_are_short() -> None:
                     long_ones.append(f"{file.relative_to(REPOSITORY)}: {lines} lines")
     if long_ones:
         warnings.warn(f"longer than {LONGEST_FILE} lines: {', '.join(long_ones)}", stacklevel=1)
-    assert not [name for name in long_ones if int(name.split(": ")[1].split()[0]) > 1.25 * LONGEST_FILE]
+    assert not [name for name in long_ones if int(name.split(": ")[1].split()[0]) > 1.5 * LONGEST_FILE]
 
 
 @pytest.mark.parametrize("pattern", [MACHINE_PATH, REGISTRY], ids=["machine path", "registry"])
