@@ -6,6 +6,7 @@ Drawn through matplotlib's object API on an Agg canvas, so that nothing global c
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -334,7 +335,9 @@ def _fit(text: Text, room: float) -> None:
     if width <= room:
         return
     text.set_fontsize(max(9.5, 14 * room / width))
-    kept = text.get_text()
+    width = float(text.get_window_extent().width)
+    kept = text.get_text()[: math.ceil(len(text.get_text()) * min(1.0, room / width))]
+    text.set_text(kept)
     while kept and text.get_window_extent().width > room:
         kept = kept[: int(0.97 * len(kept))].rstrip()
         text.set_text(kept + " …")

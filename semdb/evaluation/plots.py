@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import PercentFormatter
+from matplotlib.ticker import NullFormatter, PercentFormatter
 
 from semdb.evaluation.metrics import FALSE_TRANSLATION_M, EvaluationResult, QueryResult
 from semdb.pictures import FAINT, INK, VERDICT_COLOURS
@@ -149,12 +149,16 @@ def inlier_plot(result: EvaluationResult) -> Figure:
         )  # fmt: skip
     axes.set_xscale("log")
     axes.set_yscale("log")
+    counts = [max(query.inliers, 0.7) for query in result.per_query]
+    axes.set_xlim(min([10, *counts]) * 0.8, max([1000, *counts]) * 1.25)
     axes.set_ylim(min([*known, 0.002]) * 0.7, ceiling * 1.5)
     axes.axhline(FALSE_TRANSLATION_M, color=FAINT, lw=1.0, ls=(0, (4, 3)), zorder=1)
     place = axes.get_yaxis_transform()
     axes.text(0.99, FALSE_TRANSLATION_M * 1.07, "false above 0.25 m", color=FAINT, ha="right", transform=place)
     if any(query.translation_m is None for query in result.per_query):
         axes.text(0.99, ceiling * 0.8, "no pose", color=FAINT, ha="right", transform=place)
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.yaxis.set_minor_formatter(NullFormatter())
     axes.xaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_major_formatter("{x:g}")
     axes.set_xlabel("inliers")
