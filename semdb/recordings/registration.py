@@ -22,6 +22,7 @@ from semdb.types import Camera, Float32Array
 # Neighbours further apart than this share of their depth are two surfaces: a Kinect's step is below 1.5 % of the
 # depth up to 5 m, a floor seen at 10 degrees changes by 1 % a pixel.
 MAX_STEP = 0.03
+TOLERANCE = np.float32(-1e-4)  # a pixel centre on the edge of two triangles belongs to one of them at least
 
 
 def register_seven_scenes(depth: Float32Array, camera: Camera) -> Float32Array:
@@ -39,8 +40,9 @@ def register_seven_scenes(depth: Float32Array, camera: Camera) -> Float32Array:
     else:
         u = x * np.float32(camera.fx) + np.float32(camera.cx)
         v = y * np.float32(camera.fy) + np.float32(camera.cy)
+    known = np.nan_to_num(depth, nan=0.0)  # the kernel is compiled for numbers without NaN
     nearest = np.zeros((camera.height, camera.width), dtype=np.float32)  # 1/z, 0 is nothing
-    _rasterise(depth, u, v, inverse_z, np.float32(MAX_STEP), nearest)
+    _rasterise(known, u, v, inverse_z, np.float32(MAX_STEP), nearest)
     registered = np.full_like(nearest, np.nan)
     np.divide(np.float32(1), nearest, out=registered, where=nearest > 0)
     return registered
@@ -56,7 +58,7 @@ def _rotated_rays() -> Float32Array:  # [3, 480, 640]
     return np.ascontiguousarray(turned, dtype=np.float32)
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@numba.njit(nogil=True, cache=True, error_model="numpy", fastmath=True)
 def _rasterise(depth, u, v, inverse_z, max_step, nearest):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Both triangles of each 2x2 block: the diagonal from top right to bottom left is shared."""
     rows, columns = depth.shape
@@ -68,8 +70,8 @@ def _rasterise(depth, u, v, inverse_z, max_step, nearest):  # type: ignore[no-un
                 r2, c2 = row + 1 - half, column + half
                 a, b, c = depth[r0, c0], depth[r1, c1], depth[r2, c2]
                 low, high = min(a, b, c), max(a, b, c)
-                if not (a > 0 and b > 0 and c > 0 and high - low <= max_step * low):
-                    continue  # NaN fails a comparison
+                if low <= 0 or high - low > max_step * low:
+                    continue  # a corner is not known, or they are not one surface
                 _triangle(
                     u[r0, c0], v[r0, c0], inverse_z[r0, c0],
                     u[r1, c1], v[r1, c1], inverse_z[r1, c1],
@@ -78,7 +80,7 @@ def _rasterise(depth, u, v, inverse_z, max_step, nearest):  # type: ignore[no-un
                 )  # fmt: skip
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy", inline="always")
+@numba.njit(nogil=True, cache=True, error_model="numpy", fastmath=True, inline="always")
 def _triangle(ua, va, wa, ub, vb, wb, uc, vc, wc, nearest):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Writes 1/z of one triangle where it is the nearest surface; pixel centres are whole numbers."""
     area = (ub - ua) * (vc - va) - (vb - va) * (uc - ua)
@@ -87,11 +89,15 @@ def _triangle(ua, va, wa, ub, vb, wb, uc, vc, wc, nearest):  # type: ignore[no-u
     height, width = nearest.shape
     left, right = max(0, int(np.ceil(min(ua, ub, uc)))), min(width - 1, int(np.floor(max(ua, ub, uc))))
     top, bottom = max(0, int(np.ceil(min(va, vb, vc)))), min(height - 1, int(np.floor(max(va, vb, vc))))
+    if left > right or top > bottom:
+        return  # between pixel centres
+    scale = np.float32(1) / area
     for y in range(top, bottom + 1):
         for x in range(left, right + 1):
-            share_b = ((x - ua) * (vc - va) - (y - va) * (uc - ua)) / area
-            share_c = ((ub - ua) * (y - va) - (vb - va) * (x - ua)) / area
-            if share_b < -1e-4 or share_c < -1e-4 or share_b + share_c > 1.0001:
+            dx, dy = np.float32(x) - ua, np.float32(y) - va
+            share_b = (dx * (vc - va) - dy * (uc - ua)) * scale
+            share_c = ((ub - ua) * dy - (vb - va) * dx) * scale
+            if min(share_b, share_c) < TOLERANCE or share_b + share_c > np.float32(1) - TOLERANCE:
                 continue
             w = wa + share_b * (wb - wa) + share_c * (wc - wa)
             nearest[y, x] = max(nearest[y, x], w)
