@@ -108,8 +108,11 @@ def _summary(results: Sequence[EvaluationResult], settings: Mapping[str, str]) -
         "share of the map's keyframes compared by place vector; matched: median number of keyframes matched.</p>",
         _table(HEADERS, [result_row(result) for result in results]),
     ]
-    models = {f"{model.role}": model for result in results for model in result.models}
-    entries = {role: f"{model.name} {model.sha256[:12]}".strip() for role, model in models.items()} | dict(settings)
+    entries: dict[str, str] = {}
+    for model in dict.fromkeys(model for result in results for model in result.models):
+        name = f"{model.name} {model.sha256[:12]}".strip()
+        entries[model.role] = f"{entries[model.role]}, {name}" if model.role in entries else name
+    entries |= settings
     if entries:
         terms = "".join(f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in entries.items())
         parts.append(f"<h2>Models and settings</h2>\n<dl>{terms}</dl>")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -194,6 +195,7 @@ class Page(HTMLParser):
 
 def test_report_is_complete_and_self_contained(tmp_path: Path) -> None:
     results = [result(keyframes=50), result(keyframes=12), result(recording="desk")]
+    results[0] = replace(results[0], models=(ModelInfo("features", "sift", ""),))
     steps: list[tuple[int, int]] = []
     page = write_report(
         tmp_path / "new" / "report", results, settings={"SEMDB_FEATURES": "surf <x>"},
@@ -221,6 +223,7 @@ def test_report_is_complete_and_self_contained(tmp_path: Path) -> None:
     assert all(str(image["src"]).startswith("data:image/png;base64,") for image in images)
     assert not any(tag in ("script", "link", "a", "iframe") for tag, _ in parser.seen)
     assert "surf &lt;x&gt;" in text
+    assert "<dt>features</dt><dd>surf abababababab, sift</dd>" in text
     assert "&lt;b&gt;two places&lt;/b&gt;" in text
     assert "<b>" not in text
 
