@@ -1,4 +1,7 @@
-"""Furniture made of primitives. Frames: x to the right, y to the front, z up; origin at the back (or centre) of the base."""
+"""Furniture made of primitives.
+
+Frames: x to the right, y to the front, z up; origin at the back or the centre of the base, as each says.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ import numpy as np
 from semdb.recordings.synthetic import pictures, textures
 from semdb.recordings.synthetic.scene import Material, Prim, Texture, ball, box, cylinder
 from semdb.recordings.synthetic.textures import Colour, Rng, cloth_colour, random_colour, shift
+from semdb.types import ImageArray
 
 
 class Palette:
@@ -32,11 +36,11 @@ class Palette:
         self.leaf = Material(Texture(leaf))
 
     @staticmethod
-    def repeat(image: textures.ImageArray, metres: float) -> Material:
+    def repeat(image: ImageArray, metres: float) -> Material:
         """A repeating material, `metres` from one repetition to the next."""
         return Material(Texture(image), metres=metres)
 
-    def once(self, painter: Callable[[Rng], textures.ImageArray], emissive: bool = False) -> Material:
+    def once(self, painter: Callable[[Rng], ImageArray], emissive: bool = False) -> Material:
         """A picture made for one face."""
         return Material(Texture(painter(self.rng), wrap=False), emissive=emissive)
 
@@ -132,7 +136,7 @@ def microwave(p: Palette) -> list[Prim]:
     return [
         box((0, 0, 0.01), (0.48, 0.34, 0.27), body),
         box((-0.06, 0.172, 0.04), (0.32, 0.006, 0.2), p.dark),
-        box((0.17, 0.172, 0.04), (0.1, 0.006, 0.2), p.once(lambda r: pictures.keyboard(r))),
+        box((0.17, 0.172, 0.04), (0.1, 0.006, 0.2), p.once(pictures.keyboard)),
     ]
 
 
@@ -234,7 +238,8 @@ def _turn(yaw: float, lift: float) -> tuple[float, float, float]:
 
 def standing_books(p: Palette, width: float) -> list[tuple[list[Prim], float]]:
     """Books side by side, spines to the front: each with the x of its centre, from 0 to `width`."""
-    books, x = [], 0.0
+    books: list[tuple[list[Prim], float]] = []
+    x = 0.0
     while True:
         thick, high, deep = p.rng.uniform(0.018, 0.052), p.rng.uniform(0.17, 0.27), p.rng.uniform(0.14, 0.21)
         if x + thick > width:

@@ -1,12 +1,14 @@
 """Ray casting of boxes, frusta and ellipsoids: the compiled part of the renderer.
 
-All of it is in one file because numba's cache looks only at the file of the function that is called.
 A ray is ``o + t d`` in the frame of a primitive; rays of the camera have ``d_z = 1``, so ``t`` is depth z.
 """
 
+# mypy: disable-error-code="no-untyped-def,no-untyped-call,misc"
+# ruff: noqa: SIM109, PLR1714 - numba compiles comparisons faster than tests for membership
 from __future__ import annotations
 
 import math
+
 import numba
 import numpy as np
 
@@ -15,11 +17,11 @@ TILE = 8  # pixels
 SUBSAMPLES = 3  # per pixel side, at edges
 PROBES = 8  # most texture probes along the long axis of a pixel's footprint
 FAR = 1e30
-_njit = numba.njit(nogil=True, cache=True, error_model="numpy")
+njit = numba.njit(nogil=True, cache=True, error_model="numpy")
 
 
-@_njit
-def _hit_box(ox, oy, oz, dx, dy, dz, hx, hy, hz, inside):  # type: ignore[no-untyped-def]
+@njit
+def _hit_box(ox, oy, oz, dx, dy, dz, hx, hy, hz, inside):
     """Entry (or exit when `inside`) of a box: (t, face); face is 2 * axis + (1 on the negative side)."""
     t_in, t_out, f_in, f_out = -FAR, FAR, 0, 0
     for axis in range(3):
@@ -49,8 +51,8 @@ def _hit_box(ox, oy, oz, dx, dy, dz, hx, hy, hz, inside):  # type: ignore[no-unt
     return (t_in, f_in) if t_in > 0 else (FAR, 0)
 
 
-@_njit
-def _hit_frustum(ox, oy, oz, dx, dy, dz, r0, r1, h):  # type: ignore[no-untyped-def]
+@njit
+def _hit_frustum(ox, oy, oz, dx, dy, dz, r0, r1, h):
     """First hit of a capped cone along z: radius `r0` at -h, `r1` at +h. Face 0 side, 1 top, 2 bottom."""
     rm, k = 0.5 * (r0 + r1), 0.5 * (r1 - r0) / h
     best, face = FAR, 0
@@ -73,8 +75,8 @@ def _hit_frustum(ox, oy, oz, dx, dy, dz, r0, r1, h):  # type: ignore[no-untyped-
     return best, face
 
 
-@_njit
-def _hit(kind, ox, oy, oz, dx, dy, dz, hx, hy, hz, top):  # type: ignore[no-untyped-def]
+@njit
+def hit(kind, ox, oy, oz, dx, dy, dz, hx, hy, hz, top):
     """First hit of a primitive in its own frame: (t, face), t = FAR for none."""
     if kind == BOX or kind == ROOM:
         return _hit_box(ox, oy, oz, dx, dy, dz, hx, hy, hz, kind == ROOM)
@@ -90,8 +92,8 @@ def _hit(kind, ox, oy, oz, dx, dy, dz, hx, hy, hz, top):  # type: ignore[no-unty
     return (t, 0) if t > 0 else (FAR, 0)
 
 
-@_njit
-def _surface(kind, face, x, y, z, hx, hy, hz, top):  # type: ignore[no-untyped-def]
+@njit
+def surface(kind, face, x, y, z, hx, hy, hz, top):
     """(u, v) 0..1, outward normal and the gradients of u and v, of point (x, y, z) on a face: 11 numbers."""
     if kind == BOX or kind == ROOM:
         sign = 1.0 - 2.0 * (face % 2)
@@ -123,8 +125,8 @@ def _surface(kind, face, x, y, z, hx, hy, hz, top):  # type: ignore[no-untyped-d
     return u, v, nx / norm, ny / norm, nz / norm, -qy / (hx * turn), qx / (hy * turn), 0.0, 0.0, 0.0, gv
 
 
-@_njit
-def _fetch(texels, offset, w, h, wrap, x, y):  # type: ignore[no-untyped-def]
+@njit
+def _fetch(texels, offset, w, h, wrap, x, y):
     """Bilinear sample (r, g, b) at texel coordinates (x, y) of one level."""
     x -= 0.5
     y -= 0.5
@@ -147,8 +149,8 @@ def _fetch(texels, offset, w, h, wrap, x, y):  # type: ignore[no-untyped-def]
     )
 
 
-@_njit
-def _texture(texels, table, tex, u, v, jux, jvx, juy, jvy):  # type: ignore[no-untyped-def]
+@njit
+def _texture(texels, table, tex, u, v, jux, jvx, juy, jvy):
     """The texture `tex` filtered over a pixel's footprint: (r, g, b).
 
     jux is du/dx and so on. Probes along the long axis of the footprint ellipse, each trilinear at the level of the
@@ -185,8 +187,8 @@ def _texture(texels, table, tex, u, v, jux, jvx, juy, jvy):  # type: ignore[no-u
     return red / probes, green / probes, blue / probes
 
 
-@_njit
-def _light(lightmap, offset, nu, nv, curved, u, v):  # type: ignore[no-untyped-def]
+@njit
+def _light(lightmap, offset, nu, nv, curved, u, v):
     """The baked light (r, g, b) at (u, v) of a face."""
     x, y = u * nu - 0.5, v * nv - 0.5
     xf, yf = math.floor(x), math.floor(y)
@@ -207,8 +209,8 @@ def _light(lightmap, offset, nu, nv, curved, u, v):  # type: ignore[no-untyped-d
     )
 
 
-@_njit
-def _closest(ids, start, stop, kind, o, m, half, top, near, x, y):  # type: ignore[no-untyped-def]
+@njit
+def _closest(ids, start, stop, kind, o, m, half, top, near, x, y):
     """Nearest primitive of a tile along the camera ray (x, y, 1): (t, primitive, face). `ids` are sorted by `near`."""
     best, prim, face = FAR, -1, 0
     for k in range(start, stop):
@@ -220,20 +222,20 @@ def _closest(ids, start, stop, kind, o, m, half, top, near, x, y):  # type: igno
         dx = m[i, 0, 0] * x + m[i, 0, 1] * y + m[i, 0, 2]
         dy = m[i, 1, 0] * x + m[i, 1, 1] * y + m[i, 1, 2]
         dz = m[i, 2, 0] * x + m[i, 2, 1] * y + m[i, 2, 2]
-        t, f = _hit(kind[i], o[i, 0], o[i, 1], o[i, 2], dx, dy, dz, half[i, 0], half[i, 1], half[i, 2], top[i])
+        t, f = hit(kind[i], o[i, 0], o[i, 1], o[i, 2], dx, dy, dz, half[i, 0], half[i, 1], half[i, 2], top[i])
         if t < best:
             best, prim, face = t, i, f
     return best, prim, face
 
 
-@_njit
-def _shade(kind, half, top, ftex, fuv, fmap, tint, texels, table, lightmap, i, face, t, x, y, step, o, m):  # type: ignore[no-untyped-def]
+@njit
+def _shade(kind, half, top, ftex, fuv, fmap, tint, texels, table, lightmap, i, face, t, x, y, step, o, m):
     """The colour (r, g, b) of primitive `i` hit at depth `t` by the ray (x, y, 1); pixels are `step` apart."""
     dx = m[i, 0, 0] * x + m[i, 0, 1] * y + m[i, 0, 2]
     dy = m[i, 1, 0] * x + m[i, 1, 1] * y + m[i, 1, 2]
     dz = m[i, 2, 0] * x + m[i, 2, 1] * y + m[i, 2, 2]
     px, py, pz = o[i, 0] + t * dx, o[i, 1] + t * dy, o[i, 2] + t * dz
-    u, v, nx, ny, nz, ux, uy, uz, vx, vy, vz = _surface(
+    u, v, nx, ny, nz, ux, uy, uz, vx, vy, vz = surface(
         kind[i], face, px, py, pz, half[i, 0], half[i, 1], half[i, 2], top[i]
     )
     nd = min(nx * dx + ny * dy + nz * dz, -1e-3)
@@ -255,12 +257,12 @@ def _shade(kind, half, top, ftex, fuv, fmap, tint, texels, table, lightmap, i, f
     return r, g, b
 
 
-@_njit
-def cast(kind, half, top, tiles, ids, o, m, near, focal, cx, cy, depth, prims):  # type: ignore[no-untyped-def]
+@njit
+def cast(kind, half, top, tiles, ids, o, m, near, focal, cx, cy, depth, prims):
     """First pass: writes depth ``[H, W]`` (z of pixel centres, 0 for none) and prims (8 * primitive + face, or -1).
 
     tiles ``[rows, cols, 2]``: ranges in `ids`. o ``[n, 3]``, m ``[n, 3, 3]``: camera centre and rotation in the frame of
-    each primitive. near ``[n, 5]``: least depth of each primitive, and bounds of the rays (x0, x1, y0, y1) that can hit it.
+    each primitive. near ``[n, 5]``: its least depth, and the bounds x0, x1, y0, y1 of the rays that can hit it.
     """
     height, width = depth.shape
     for v in range(height):
@@ -273,7 +275,7 @@ def cast(kind, half, top, tiles, ids, o, m, near, focal, cx, cy, depth, prims): 
                 prims[v, u] = 8 * i + f
 
 
-@_njit
+@njit
 def shade(
     kind,
     half,
@@ -296,7 +298,7 @@ def shade(
     depth,
     prims,
     rgb,
-):  # type: ignore[no-untyped-def]
+):
     """Second pass: writes rgb ``[H, W, 3]`` uint8 from what `cast` found.
 
     Where a pixel and its neighbours see more than one face, a grid of rays finds the share of each face in the
@@ -350,161 +352,3 @@ def shade(
             rgb[v, u, 0] = np.uint8(min(max(red / total + 0.5, 0.0), 255.0))
             rgb[v, u, 1] = np.uint8(min(max(green / total + 0.5, 0.0), 255.0))
             rgb[v, u, 2] = np.uint8(min(max(blue / total + 0.5, 0.0), 255.0))
-
-
-@_njit
-def trace(bvh_box, bvh_link, order, kind, rot, centre, half, top, px, py, pz, dx, dy, dz, t_max, stack):  # type: ignore[no-untyped-def]
-    """Nearest primitive along ``p + t d`` in the world, ``t < t_max``: (t, primitive or -1, face). `stack` ``[64]`` is scratch."""
-    stack[0] = 0
-    size, best, prim, face = 1, t_max, -1, 0
-    ix, iy, iz = (
-        1 / (dx if abs(dx) > 1e-12 else 1e-12),
-        1 / (dy if abs(dy) > 1e-12 else 1e-12),
-        1 / (dz if abs(dz) > 1e-12 else 1e-12),
-    )
-    while size > 0:
-        size -= 1
-        node = stack[size]
-        ta, tb = (bvh_box[node, 0] - px) * ix, (bvh_box[node, 3] - px) * ix
-        t0, t1 = max(0.0, min(ta, tb)), min(best, max(ta, tb))
-        ta, tb = (bvh_box[node, 1] - py) * iy, (bvh_box[node, 4] - py) * iy
-        t0, t1 = max(t0, min(ta, tb)), min(t1, max(ta, tb))
-        ta, tb = (bvh_box[node, 2] - pz) * iz, (bvh_box[node, 5] - pz) * iz
-        t0, t1 = max(t0, min(ta, tb)), min(t1, max(ta, tb))
-        if t0 > t1:
-            continue
-        left, count = bvh_link[node, 0], bvh_link[node, 1]
-        if count == 0:
-            stack[size], stack[size + 1] = left, left + 1
-            size += 2
-            continue
-        for k in range(left, left + count):
-            i = order[k]
-            x, y, z = px - centre[i, 0], py - centre[i, 1], pz - centre[i, 2]
-            ox, oy = (
-                rot[i, 0, 0] * x + rot[i, 0, 1] * y + rot[i, 0, 2] * z,
-                rot[i, 1, 0] * x + rot[i, 1, 1] * y + rot[i, 1, 2] * z,
-            )
-            oz = rot[i, 2, 0] * x + rot[i, 2, 1] * y + rot[i, 2, 2] * z
-            ex, ey = (
-                rot[i, 0, 0] * dx + rot[i, 0, 1] * dy + rot[i, 0, 2] * dz,
-                rot[i, 1, 0] * dx + rot[i, 1, 1] * dy + rot[i, 1, 2] * dz,
-            )
-            ez = rot[i, 2, 0] * dx + rot[i, 2, 1] * dy + rot[i, 2, 2] * dz
-            t, f = _hit(kind[i], ox, oy, oz, ex, ey, ez, half[i, 0], half[i, 1], half[i, 2], top[i])
-            if t < best:
-                best, prim, face = t, i, f
-    return best, prim, face
-
-
-@_njit
-def bake(bvh_box, bvh_link, order, world, fmap, mean, lamps, dirs, reach, ambient, lightmap):  # type: ignore[no-untyped-def]
-    """Fills `lightmap` ``[texels, 3]`` with the light that each texel of each face receives.
-
-    lamps ``[l, 9]``: points of area lights (position, normal, colour). dirs ``[k, 3]``: cosine-weighted directions
-    about +z for the light that comes from other surfaces, whose colours are `mean` ``[n, 6, 3]``; what is nearer than
-    `reach` metres gives less of it (ambient occlusion).
-    """
-    kind, rot, centre, half, top = world
-    stack = np.zeros(64, np.int64)
-    n, p, q, d, nw = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
-    for i in range(kind.shape[0]):
-        for face in range(6):
-            offset, nu, nv = fmap[i, face, 0], fmap[i, face, 1], fmap[i, face, 2]
-            for texel in range(nu * nv if offset >= 0 else 0):
-                _face_point(kind[i], face, (texel % nu + 0.5) / nu, (texel // nu + 0.5) / nv, half[i], top[i], p)
-                _, _, n[0], n[1], n[2], _, _, _, _, _, _ = _surface(
-                    kind[i], face, p[0], p[1], p[2], half[i, 0], half[i, 1], half[i, 2], top[i]
-                )
-                for c in range(3):
-                    nw[c] = rot[i, 0, c] * n[0] + rot[i, 1, c] * n[1] + rot[i, 2, c] * n[2]
-                    q[c] = centre[i, c] + 2e-3 * nw[c]
-                    for r in range(3):
-                        q[c] += rot[i, r, c] * p[r]
-                light = lightmap[offset + texel]
-                for k in range(lamps.shape[0]):
-                    dist2 = 0.0
-                    for c in range(3):
-                        d[c] = lamps[k, c] - q[c]
-                        dist2 += d[c] * d[c]
-                    cos_here = (nw[0] * d[0] + nw[1] * d[1] + nw[2] * d[2]) / math.sqrt(dist2)
-                    cos_lamp = -(lamps[k, 3] * d[0] + lamps[k, 4] * d[1] + lamps[k, 5] * d[2]) / math.sqrt(dist2)
-                    if cos_here <= 0 or cos_lamp <= 0:
-                        continue
-                    _, blocker, _ = trace(
-                        bvh_box,
-                        bvh_link,
-                        order,
-                        kind,
-                        rot,
-                        centre,
-                        half,
-                        top,
-                        q[0],
-                        q[1],
-                        q[2],
-                        d[0],
-                        d[1],
-                        d[2],
-                        0.995,
-                        stack,
-                    )
-                    if blocker < 0:
-                        for c in range(3):
-                            light[c] += lamps[k, 6 + c] * cos_here * cos_lamp / (dist2 + 0.3)
-                ax, ay, az = (1.0, 0.0, 0.0) if abs(nw[0]) < 0.8 else (0.0, 1.0, 0.0)
-                bx, by, bz = nw[1] * az - nw[2] * ay, nw[2] * ax - nw[0] * az, nw[0] * ay - nw[1] * ax
-                norm = math.sqrt(bx * bx + by * by + bz * bz)
-                bx, by, bz = bx / norm, by / norm, bz / norm
-                cx, cy, cz = nw[1] * bz - nw[2] * by, nw[2] * bx - nw[0] * bz, nw[0] * by - nw[1] * bx
-                for k in range(dirs.shape[0]):
-                    d[0] = dirs[k, 0] * bx + dirs[k, 1] * cx + dirs[k, 2] * nw[0]
-                    d[1] = dirs[k, 0] * by + dirs[k, 1] * cy + dirs[k, 2] * nw[1]
-                    d[2] = dirs[k, 0] * bz + dirs[k, 1] * cz + dirs[k, 2] * nw[2]
-                    t, hit, f = trace(
-                        bvh_box,
-                        bvh_link,
-                        order,
-                        kind,
-                        rot,
-                        centre,
-                        half,
-                        top,
-                        q[0],
-                        q[1],
-                        q[2],
-                        d[0],
-                        d[1],
-                        d[2],
-                        FAR,
-                        stack,
-                    )
-                    if hit >= 0:
-                        near = min(t / reach, 1.0)
-                        for c in range(3):
-                            light[c] += ambient * near * mean[hit, f, c] / dirs.shape[0]
-
-
-@_njit
-def _face_point(kind, face, u, v, half, top, p):  # type: ignore[no-untyped-def]
-    """Writes the point at (u, v) of a face: the inverse of `_surface`."""
-    if kind == BOX or kind == ROOM:
-        axis, sign = face // 2, 1.0 - 2.0 * (face % 2)
-        flip = -1.0 if kind == ROOM else 1.0
-        p[axis] = sign * half[axis]
-        ua = 1 if axis == 0 else 0
-        va = 1 if axis == 2 else 2
-        us = flip * (-sign if axis == 1 else sign)
-        p[ua] = us * (2 * u - 1) * half[ua]
-        p[va] = (1 - 2 * v) * half[va]
-    elif kind == FRUSTUM and face > 0:
-        r = top if face == 1 else half[0]
-        p[0], p[1], p[2] = (2 * u - 1) * r * 0.7, (1 - 2 * v) * r * 0.7, half[2] if face == 1 else -half[2]
-    else:
-        angle, z = (u - 0.5) * 2 * math.pi, (1 - 2 * v) * half[2]
-        if kind == FRUSTUM:
-            r = half[0] + (top - half[0]) * (1 - v)
-            p[0], p[1], p[2] = r * math.cos(angle), r * math.sin(angle), z
-        else:
-            s = math.sqrt(max(1 - (1 - 2 * v) ** 2, 0.0))
-            p[0], p[1], p[2] = half[0] * s * math.cos(angle), half[1] * s * math.sin(angle), z

@@ -24,7 +24,7 @@ def write(
     """Writes made-up words in a box of `image`, in place."""
     lengths = rng.integers(3, 9, words)
     step = min(width / (int(lengths.sum()) + words - 1), 0.7 * height)
-    thickness = max(int(round(0.16 * step / 0.7)), 1)
+    thickness = max(round(0.16 * step / 0.7), 1)
     at = float(x)
     for length in lengths:
         for k in rng.integers(0, len(_GRID), length):

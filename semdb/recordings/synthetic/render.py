@@ -50,7 +50,7 @@ def _hemisphere(count: int) -> FloatArray:
 def _hierarchy(low: FloatArray, high: FloatArray) -> tuple[FloatArray, Int64Array, Int64Array]:
     """Bounding volume hierarchy by median splits: boxes ``[m, 6]``, links ``[m, 2]`` (first, count), order ``[n]``.
 
-    A node with count 0 has its children at `first` and `first + 1`; otherwise it holds ``order[first : first + count]``.
+    A node with count 0 has its children at `first` and `first + 1`, others hold ``order[first : first + count]``.
     """
     order = np.arange(len(low))
     boxes: list[FloatArray] = [np.zeros(6)]
@@ -76,14 +76,14 @@ def _hierarchy(low: FloatArray, high: FloatArray) -> tuple[FloatArray, Int64Arra
 
 def bake_light(scene: PackedScene, lamps: list[Lamp]) -> PackedScene:
     """`scene` with the light of `lamps`, their soft shadows and ambient occlusion. Depends on nothing that moves."""
-    from semdb.recordings.synthetic import kernels
+    from semdb.recordings.synthetic import kernels_light
 
     boxes, links, order = _hierarchy(scene.corners.min(axis=1), scene.corners.max(axis=1))
     light = np.zeros(scene.light.shape, np.float64)
     world = (scene.kind, scene.rotation, scene.centre, scene.half, scene.top)
     mean = np.minimum(scene.mean, 1.0)
     directions = _hemisphere(DIRECTIONS)
-    kernels.bake(
+    kernels_light.bake(
         boxes, links, order, world, scene.light_map, mean, _lamp_points(lamps), directions, AMBIENT_REACH, 0.85, light
     )
     # textures are kept as displayed (gamma 2.2), so light is brought to the same scale

@@ -174,7 +174,7 @@ def _dining(room: Room, p: Palette, rng: Rng, corner: np.ndarray) -> None:
         room.solid.append((at[0, 3] - 0.25, at[1, 3] - 0.25, at[0, 3] + 0.25, at[1, 3] + 0.25))
     spot = Spot(pose @ yaw_pose(0, 0, 0.75), (long / 2 - 0.05, across / 2 - 0.05))
     wanted = ["cup", "cup", "bowl", "bottle", "vase", "wine glass", "book", "apple", "orange", "laptop", "banana"]
-    scatter(room, p, rng, spot, [str(c) for c in rng.permutation(wanted)[: int(rng.integers(4, 8))]])
+    scatter(room, p, rng, spot, [str(c) for c in rng.permutation(wanted)[: int(rng.integers(5, 9))]])
 
 
 def scatter(room: Room, p: Palette, rng: Rng, spot: Spot, categories: list[str]) -> None:
@@ -205,7 +205,7 @@ def free_place(rng: Rng, spot: Spot, radius: float) -> tuple[float, float] | Non
 class Kind:
     """A piece of furniture that stands at a wall."""
 
-    build: Callable[[Room, Palette, Rng, FloatArray, float], None]
+    build: Callable[[Room, Palette, Rng, FloatArray, float], object]
     width: tuple[float, float]
     depth: float
     height: float
@@ -313,7 +313,7 @@ def _bookcase(room: Room, p: Palette, rng: Rng, pose: FloatArray, width: float) 
     room.add(None, furniture.shelf(p, width, height, boards, p.pick(p.wood)), pose)
     for k in range(boards - 1):
         z = 0.08 + k * (height - 0.08) / (boards - 1)
-        share = float(rng.uniform(0.35, 0.8))
+        share = float(rng.uniform(0.2, 0.5))
         left = -width / 2 + 0.04
         for prims, x in furniture.standing_books(p, share * (width - 0.1)):
             at = pose @ yaw_pose(left + x, 0.31 - 2 * prims[0].half[1] - float(rng.uniform(0, 0.03)), z)
@@ -339,8 +339,8 @@ def _desk(room: Room, p: Palette, rng: Rng, pose: FloatArray, width: float) -> N
         scatter(room, p, rng, spot, ["laptop", "mouse"])
     wanted = ["cup", "book", "book", "cell phone", "bottle", "potted plant", "remote", "scissors"]
     scatter(room, p, rng, spot, [str(c) for c in rng.permutation(wanted)[:4]])
-    at = pose @ yaw_pose(float(rng.uniform(-0.2, 0.2)), 0.86, 0, np.pi + float(rng.uniform(-0.5, 0.5)))
-    room.add("chair", furniture.chair(p, wood, p.pick(p.cloth)), at, 0.3)
+    place = pose @ yaw_pose(float(rng.uniform(-0.2, 0.2)), 0.86, 0, np.pi + float(rng.uniform(-0.5, 0.5)))
+    room.add("chair", furniture.chair(p, wood, p.pick(p.cloth)), place, 0.3)
 
 
 def _counter(room: Room, p: Palette, rng: Rng, pose: FloatArray, width: float) -> None:
@@ -379,15 +379,16 @@ _FURNITURE = (
     Kind(_simple("refrigerator", furniture.refrigerator), (0.72, 0.72), 0.72, 1.8, 0.45),
     Kind(_simple("oven", furniture.oven), (0.62, 0.62), 0.66, 0.9, 0.4),
     Kind(_counter, (1.1, 1.5), 0.6, 0.9, 0.55),
-    Kind(_tv_corner, (1.3, 1.7), 0.45, 1.0, 0.65),
-    Kind(_sideboard, (1.0, 1.4), 0.44, 0.84, 0.7),
+    Kind(_tv_corner, (1.3, 1.7), 0.45, 1.0, 0.75),
+    Kind(_sideboard, (1.0, 1.4), 0.44, 0.84, 0.8),
+    Kind(_sideboard, (0.8, 1.1), 0.44, 0.84, 0.35),
     Kind(_plant, (0.55, 0.55), 0.55, 0.9, 0.7),
     Kind(_plant, (0.55, 0.55), 0.55, 0.9, 0.4),
     Kind(
         lambda r, p, g, q, w: r.add("bench", furniture.bench(p, p.pick(p.wood)), q, 0.6), (1.22, 1.22), 0.4, 0.5, 0.35
     ),
     Kind(_lamp, (0.44, 0.44), 0.44, 1.6, 0.5),
-    Kind(_centred("suitcase", furniture.suitcase, 0.34), (0.52, 0.52), 0.34, 0.7, 0.4),
-    Kind(_centred("backpack", furniture.backpack, 0.36), (0.4, 0.4), 0.36, 0.5, 0.4),
-    Kind(_centred("sports ball", furniture.sports_ball, 0.3), (0.3, 0.3), 0.3, 0.3, 0.4),
+    Kind(_centred("suitcase", furniture.suitcase, 0.34), (0.52, 0.52), 0.34, 0.7, 0.5),
+    Kind(_centred("backpack", furniture.backpack, 0.36), (0.4, 0.4), 0.36, 0.5, 0.5),
+    Kind(_centred("sports ball", furniture.sports_ball, 0.3), (0.3, 0.3), 0.3, 0.3, 0.5),
 )

@@ -85,7 +85,7 @@ def yaw_pose(x: float, y: float, z: float, yaw: float = 0.0) -> FloatArray:
 def box(
     at: Sequence[float], size: Sequence[float], material: Material, turn: Sequence[float] = (0, 0, 0), **faces: Material
 ) -> Prim:
-    """A box with the centre of its base at `at`; `faces` by name: right, left, front, back, top, bottom (+x, -x, ...)."""
+    """A box with the centre of its base at `at`. `faces`: right, left, front, back, top, bottom (+x, -x, +y, ...)."""
     names = ("right", "left", "front", "back", "top", "bottom")
     rotation = so3_exp(turn)
     centre = np.asarray(at, np.float64) + rotation @ [0, 0, size[2] / 2]

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from semdb.geometry import invert_pose
+from semdb.recordings.synthetic.textures import to_image
 from semdb.types import Camera, Float32Array, FloatArray, ImageArray
 
 BASELINE = 0.075  # metres, of a structured-light sensor
@@ -14,7 +15,7 @@ BLUR_TAPS = 9
 
 
 def _rays(camera: Camera) -> tuple[Float32Array, Float32Array]:
-    """x and y of the rays of all pixels, z = 1."""
+    """The rays of all pixels: x and y, with z = 1."""
     x = (np.arange(camera.width, dtype=np.float32) - camera.cx) / camera.fx
     y = (np.arange(camera.height, dtype=np.float32) - camera.cy) / camera.fy
     return np.broadcast_to(x, (camera.height, camera.width)), np.broadcast_to(y[:, None], (camera.height, camera.width))
@@ -45,7 +46,7 @@ def motion_blur(
 def change_light(
     image: ImageArray, depth: Float32Array, camera: Camera, pose: FloatArray, strength: float, seed: int, index: int
 ) -> ImageArray:
-    """Another time of day: gain and colour cast of the whole recording, light from one side of the room, slow flicker."""
+    """Another time of day: gain and colour cast of the recording, more light on one side of the room, slow flicker."""
     rng = np.random.default_rng([seed, 4])
     gain = 2.0 ** (strength * rng.uniform(0.35, 0.8) * rng.choice([-1.0, 1.0]))
     cast = 1 + strength * rng.uniform(-0.16, 0.16, 3)
@@ -58,7 +59,7 @@ def change_light(
     along = (x * in_camera[0] + y * in_camera[1] + in_camera[2]) * depth + np.float32(axis @ pose[:3, 3])
     gradient = np.clip(1 + 0.16 * strength * along, 0.3, 2.0)
     lit = image * (gradient * np.float32(gain * flicker))[..., None] * cast.astype(np.float32)
-    return np.clip(np.rint(lit), 0, 255).astype(np.uint8)
+    return to_image(lit)
 
 
 def noisy_image(image: ImageArray, rng: np.random.Generator) -> ImageArray:
@@ -66,7 +67,7 @@ def noisy_image(image: ImageArray, rng: np.random.Generator) -> ImageArray:
     noise = rng.standard_normal(image.shape, dtype=np.float32)
     noise = 1.6 * cv2.GaussianBlur(noise, (3, 3), 0.5)
     level = np.sqrt(2.2 + 0.035 * image.astype(np.float32))
-    return np.clip(np.rint(image + noise * level), 0, 255).astype(np.uint8)
+    return to_image(image + noise * level)
 
 
 def noisy_depth(depth: Float32Array, camera: Camera, rng: np.random.Generator) -> Float32Array:

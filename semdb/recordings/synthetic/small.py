@@ -8,7 +8,7 @@ import numpy as np
 
 from semdb.recordings.synthetic import furniture as f
 from semdb.recordings.synthetic.furniture import Palette
-from semdb.recordings.synthetic.scene import Material, Prim, Texture, ball, box, yaw_pose
+from semdb.recordings.synthetic.scene import Material, Prim, Texture, ball, box
 from semdb.recordings.synthetic.textures import speckle
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -18,7 +19,8 @@ def noise(
 ) -> Float32Array:
     """Tileable fractal noise ``[height, width]`` with mean 0 and standard deviation 1.
 
-    `cells` are those of the coarsest octave (down, across), rounded to powers of two; each octave doubles them and is `gain` times weaker.
+    `cells` are those of the coarsest octave (down, across), rounded to powers of two. Each octave doubles them and is
+    `gain` times weaker.
     """
     total = np.zeros((height, width), np.float32)
     weight = 1.0
@@ -100,7 +102,7 @@ def planks(rng: Rng, colour: Colour, rows: int = 22, size: int = 2048) -> ImageA
     base = wood(rng, colour, 1024).astype(np.float32)
     floor = np.zeros((size, size, 3), np.float32)
     edges = np.linspace(0, size, rows + 1).astype(int)
-    for y0, y1 in zip(edges[:-1], edges[1:], strict=True):
+    for y0, y1 in pairwise(edges):
         x = -int(rng.integers(0, 500))
         while x < size:
             length = int(rng.integers(330, 620))
@@ -185,11 +187,11 @@ def bricks(rng: Rng, colour: Colour, height: int = 1024, width: int = 2048) -> I
 
 def tiles(rng: Rng, colour: Colour, size: int = 2048, count: int = 14) -> ImageArray:
     """Marbled floor tiles with joints."""
-    vein = np.abs(noise(rng, size, size, (9, 9), 7, 0.6))
-    image = tinted(colour, 0.13 * np.minimum(vein, 0.8) - 0.1, 0.03 * noise(rng, size, size, (256, 256), 2))
+    vein = np.minimum(np.abs(noise(rng, size, size, (9, 9), 7, 0.6)), np.float32(0.8))
+    image = tinted(colour, np.asarray(0.13 * vein - 0.1, np.float32), 0.03 * noise(rng, size, size, (256, 256), 2))
     edges = np.linspace(0, size, count + 1).astype(int)
-    for y0, y1 in zip(edges[:-1], edges[1:], strict=True):
-        for x0, x1 in zip(edges[:-1], edges[1:], strict=True):
+    for y0, y1 in pairwise(edges):
+        for x0, x1 in pairwise(edges):
             image[y0:y1, x0:x1] *= rng.uniform(0.86, 1.08)
             image[y0 : y0 + 3, x0:x1] *= 0.62
             image[y0:y1, x0 : x0 + 3] *= 0.62

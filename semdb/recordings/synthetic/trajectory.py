@@ -44,7 +44,7 @@ def walk(room: Room, frames: int, lap_frames: int, seed: int, second_visit: bool
     knots = KNOTS * laps + 1
     share = np.tile(rng.uniform(0.5, 0.85, KNOTS), laps + 1)[:knots] + rng.uniform(-0.05, 0.05, knots)
     sense = 1.0 if rng.random() < 0.5 else -1.0
-    start, look = rng.uniform(0, 2 * np.pi, 2)
+    start, look = rng.uniform(0, 2 * np.pi), rng.uniform(0.55 * np.pi, 1.45 * np.pi)  # looks across the room
     angle = start + sense * 2 * np.pi * (np.arange(knots) / KNOTS) + rng.uniform(-0.12, 0.12, knots)
     reach = np.array([_free_radius(room, a) for a in angle])
     height = 1.4 + np.tile(rng.uniform(-0.13, 0.13, KNOTS), laps + 1)[:knots]

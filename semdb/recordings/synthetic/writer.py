@@ -140,7 +140,13 @@ def _write_all(folder: Path, sequence: SyntheticSequence, progress: Callable[[in
         w, x, y, z = quat_wxyz_from_rotation(pose[:3, :3])
         rows.append(" ".join([stem, *(repr(float(v)) for v in (*pose[:3, 3], x, y, z, w))]))
     (folder / "groundtruth.txt").write_text("\n".join([*rows, ""]))
-    lens = {"width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy, "cx": camera.cx}
+    lens: dict[str, float | list[float]] = {
+        "width": camera.width,
+        "height": camera.height,
+        "fx": camera.fx,
+        "fy": camera.fy,
+        "cx": camera.cx,
+    }
     lens |= {"cy": camera.cy, "distortion": [], "depth_scale": int(DEPTH_SCALE)}
     (folder / "camera.json").write_text(json.dumps(lens, indent=2) + "\n")
     classes = {str(label): name for label, name in sorted(sequence.classes.items())}
