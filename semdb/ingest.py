@@ -18,7 +18,7 @@ from semdb.database.records import KeyframeRecord, PlannedRecording, RecordingPl
 from semdb.database.store import Store, open_store
 from semdb.errors import FrameError, UsageError
 from semdb.keyframes import select_keyframes
-from semdb.model_choice import ModelSpecs, specs_for_ingest
+from semdb.model_choice import settings_of_map, specs_for_ingest
 from semdb.perception.describe import Describer, describer_from_specs
 from semdb.recordings import open_recordings
 from semdb.recordings.base import DroppedFrame, FrameEntry, Recording
@@ -84,16 +84,18 @@ def ingest_recordings(
         recordings[0].name = options.name
     _check_names(recordings)
     store = open_store(settings.database_url, create=True)
-    describers: dict[ModelSpecs, Describer] = {}
+    describers: dict[object, Describer] = {}
     summaries = []
     for recording in recordings:
         map_models = map_models_of(store, options.map_name or default_map_name(recording))
         specs = specs_for_ingest(settings, map_models, has_masks=recording.categories is not None)
         for note in (*recording.notes, *specs.notes):
             (say or _nobody)(f"{recording.name}: {note}")
-        if specs not in describers:
-            describers[specs] = describer_from_specs(specs.detector, specs.encoder, specs.features, settings)
-        summary = ingest_recording(recording, store, describers[specs], options, progress=progress)
+        own = settings_of_map(settings, map_models)
+        key = (specs, own.score_threshold, own.max_keypoints)
+        if key not in describers:
+            describers[key] = describer_from_specs(specs.detector, specs.encoder, specs.features, own)
+        summary = ingest_recording(recording, store, describers[key], options, progress=progress)
         summary.notes = (*recording.notes, *specs.notes)
         summaries.append(summary)
     return summaries

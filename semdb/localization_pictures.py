@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -10,17 +11,21 @@ import numpy as np
 from semdb.database.store import Store
 from semdb.geometry import pose_error, transform_points
 from semdb.localize import ImageLocalization
-from semdb.pictures import combine_pictures, draw_localization, localization_facts
+from semdb.pictures import category_colours, combine_pictures, draw_localization, localization_facts
 from semdb.recordings import decode_color
 from semdb.top_view import MapObject, draw_top_view
 from semdb.types import Detection, ImageArray, Localization
 
 
-def write_picture(directory: Path, store: Store, answer: ImageLocalization) -> Path:
-    """Writes ``DIR/<image name>.png`` (numbered where that name is taken) and returns its path."""
+def write_picture(directory: Path, store: Store, answer: ImageLocalization, taken: set[Path]) -> Path:
+    """Writes ``DIR/<image name>.png`` and returns its path. Names in `taken` are numbered on, and it is added."""
     picture = draw_picture(store, answer)
     stem = answer.query.path.stem
-    path = directory / f"{stem}.png"
+    path, number = directory / f"{stem}.png", 1
+    while path in taken:
+        number += 1
+        path = directory / f"{stem}-{number}.png"
+    taken.add(path)
     encoded = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1]
     path.write_bytes(encoded.tobytes())
     return path
@@ -45,7 +50,8 @@ def draw_picture(store: Store, answer: ImageLocalization) -> ImageArray:
         facts=localization_facts(found, error),
         keyframe_label=label,
     )
-    return combine_pictures([matches, _top_view(store, answer)])
+    classes = [thing.category for thing in (*answer.description.detections, *detections)]
+    return combine_pictures([matches, _top_view(store, answer, classes)])
 
 
 def _keyframe(store: Store, found: Localization) -> tuple[ImageArray | None, tuple[Detection, ...], str]:
@@ -62,7 +68,7 @@ def _keyframe(store: Store, found: Localization) -> tuple[ImageArray | None, tup
     return image, detections, f"best keyframe: {stored.recording}, frame {stored.frame_index}"
 
 
-def _top_view(store: Store, answer: ImageLocalization) -> ImageArray:
+def _top_view(store: Store, answer: ImageLocalization, classes: Sequence[str]) -> ImageArray:
     found = answer.localization
     info = store.find_map(found.map_name)
     ids, poses = store.poses(info.id)
@@ -77,6 +83,8 @@ def _top_view(store: Store, answer: ImageLocalization) -> ImageArray:
         poses,
         found.world_from_camera,
         covariance=found.covariance,
+        verdict=found.verdict,
+        colours=category_colours(classes),
         objects=objects,
         true_pose=answer.query.world_from_camera,
         candidates=[position for position, keyframe_id in enumerate(ids) if keyframe_id in matched],

@@ -14,7 +14,7 @@ from semdb.errors import NotFoundError, ProvenanceError, UsageError
 from semdb.localization.keyframe_cache import KeyframeCache
 from semdb.localization.localizer import Localizer, LocalizerOptions
 from semdb.localization.sources import MemorySource, SqlSource
-from semdb.model_choice import ModelSpecs, specs_for_query
+from semdb.model_choice import settings_of_map, specs_for_query
 from semdb.perception.describe import Describer, describer_from_specs
 from semdb.query_image import LikeCamera, QueryImage, QueryReader
 from semdb.recordings import open_recordings
@@ -47,7 +47,6 @@ class ImageLocalization:
 @dataclass(frozen=True, slots=True, eq=False)
 class _MapLocalizer:
     info: MapInfo
-    specs: ModelSpecs
     describer: Describer
     localizer: Localizer
 
@@ -104,7 +103,7 @@ def _open_maps(
     if not infos or not infos[0].keyframes:
         name = f"map {options.map_name!r}" if options.map_name else "the database"
         raise NotFoundError(f"{name} holds no keyframe: ingest a recording first (semdb ingest PATH)")
-    describers: dict[ModelSpecs, Describer] = {}
+    describers: dict[object, Describer] = {}
     opened, refused = [], []
     for info in infos:
         try:
@@ -121,24 +120,28 @@ def _open_maps(
 
 
 def _open_map(
-    store: Store, info: MapInfo, settings: Settings, options: LocalizeOptions, describers: dict[ModelSpecs, Describer]
+    store: Store, info: MapInfo, settings: Settings, options: LocalizeOptions, describers: dict[object, Describer]
 ) -> _MapLocalizer:
     models = store.map_models(info.id)
     specs = specs_for_query(settings, models)
-    if specs not in describers:
-        describers[specs] = describer_from_specs(specs.detector, specs.encoder, specs.features, settings)
-    check_models(models, describers[specs].models, f"the map {info.name!r}")
-    return _MapLocalizer(info, specs, describers[specs], make_localizer(store, info, options.coarse, options.localizer))
+    own = settings_of_map(settings, models)
+    key = (specs, own.score_threshold, own.max_keypoints)
+    if key not in describers:
+        describers[key] = describer_from_specs(specs.detector, specs.encoder, specs.features, own)
+    check_models(models, describers[key].models, f"the map {info.name!r}")
+    return _MapLocalizer(info, describers[key], make_localizer(store, info, options.coarse, options.localizer))
 
 
 def _ask(maps: Sequence[_MapLocalizer], query: QueryImage) -> tuple[Description, Localization]:
     """The best answer of all maps; two maps that both know the place make it ambiguous."""
-    described: dict[ModelSpecs, Description] = {}
+    described: dict[Describer, Description] = {}
     answers: list[tuple[Description, Localization]] = []
     for entry in maps:
-        if entry.specs not in described:
-            described[entry.specs] = entry.describer.describe(query.image, query.depth, query.camera, query.instances)
-        answers.append((described[entry.specs], entry.localizer.localize(described[entry.specs])))
+        if entry.describer not in described:
+            described[entry.describer] = entry.describer.describe(
+                query.image, query.depth, query.camera, query.instances
+            )
+        answers.append((described[entry.describer], entry.localizer.localize(described[entry.describer])))
     order = {Verdict.LOCALIZED: 2, Verdict.AMBIGUOUS: 1, Verdict.FAILED: 0}
     answers.sort(key=lambda answer: (order[answer[1].verdict], answer[1].inliers), reverse=True)
     description, best = answers[0]

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
-from semdb.errors import UsageError
+from semdb.errors import ModelError, UsageError
+from semdb.perception.model_files import models_dir, resolve_onnx
 from semdb.settings import Settings
 from semdb.types import ModelInfo
 
@@ -71,15 +72,29 @@ def specs_for_query(settings: Settings, map_models: Sequence[ModelInfo]) -> Mode
     return ModelSpecs(chosen["detector"], chosen["encoder"], chosen["features"])
 
 
+def settings_of_map(settings: Settings, map_models: Sequence[ModelInfo]) -> Settings:
+    """`settings` with what is not set there taken from the configuration that the map's rows were made with.
+
+    So a query, or a second recording, is described as the map was. What is set and differs stays: comparing the
+    models then says so.
+    """
+    taken = {}
+    for model in map_models:
+        config = json.loads(model.config)
+        for name in ("score_threshold", "max_keypoints"):
+            if name in config and name not in settings.model_fields_set:
+                taken[name] = config[name]
+    return settings.model_copy(update=taken)
+
+
 def _spec_of(model: ModelInfo, settings: Settings) -> str:
-    """The spec that loads `model` here; files of ``onnx:`` models are looked for in the cache directory."""
-    scheme, _, file_name = model.name.partition(":")
-    if not file_name or scheme != "onnx":
+    """The spec that loads `model` here; files of ``onnx:`` models are looked for where bare names are."""
+    if not model.name.startswith("onnx:"):
         return model.name
-    path: Path = settings.cache_dir.expanduser() / "models" / file_name
-    if path.is_file():
-        return f"onnx:{path}"
-    raise UsageError(
-        f"the map was described by {model.role} {model.name} (sha256 {model.sha256[:12]}...): set "
-        f"SEMDB_{model.role.upper()}=onnx:PATH to that file, or put it at {path}"
-    )
+    try:
+        return f"onnx:{resolve_onnx(model.name, settings)}"
+    except ModelError as error:
+        raise UsageError(
+            f"the map was described by the {model.role} {model.name} (sha256 {model.sha256[:12]}), which is not at "
+            f"hand: set SEMDB_{model.role.upper()}=onnx:PATH to that file, or put it into {models_dir(settings)}"
+        ) from error

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.mariadb import MariaDBError, TestServer, server
+from tests.rooms import render
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
@@ -46,3 +47,9 @@ def empty_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     if request.param == "sqlite":
         return f"sqlite:///{tmp_path / 'semdb.sqlite3'}"
     return str(request.getfixturevalue("mariadb_url"))
+
+
+@pytest.fixture(scope="session")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A rendered recording of 24 frames, 320x240."""
+    return render(tmp_path_factory.mktemp("rendered") / "room")

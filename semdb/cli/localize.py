@@ -47,6 +47,7 @@ def command(
     if plot is not None:
         plot.mkdir(parents=True, exist_ok=True)
     results: list[dict[str, Any]] = []
+    pictures: set[Path] = set()
     with open_store(settings.database_url) as store:
         for answer in localize_images(images, depth or [], store, settings, options, say=say):
             if json:
@@ -56,7 +57,7 @@ def command(
             if plot is not None:
                 from semdb.localization_pictures import write_picture
 
-                say(f"wrote {write_picture(plot, store, answer)}")
+                say(f"wrote {write_picture(plot, store, answer, pictures)}")
     if json:
         print_json(results)
 

@@ -71,14 +71,16 @@ class Localizer:
         """
         self._check(description)
         search = _Search(self._view_of(description))
+        source = _TimedSource(self.source)
         started = time.perf_counter()
-        batches = cascade(self.source, _class_counts(description), description.cnn_vector, self.options.coarse)
-        for batch in batches:
+        for batch in cascade(source, _class_counts(description), description.cnn_vector, self.options.coarse):
             search.timing_ms["rank"] += _ms_since(started)
             self._try(search, batch)
             if convinces(search.estimate, self.options.verdict):
                 break
             started = time.perf_counter()
+        search.timing_ms["filter"] = source.filter_ms
+        search.timing_ms["rank"] -= source.filter_ms
         return self._conclude(search)
 
     def localize_among(self, description: Description, keyframe_ids: Sequence[int]) -> Localization:

@@ -1,0 +1,171 @@
+"""Ingest on both servers: the rows, running again, cut off and run again, broken frames."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import select
+
+from semdb.database import tables
+from semdb.database.store import Store, open_store
+from semdb.errors import ProvenanceError, UsageError
+from semdb.ingest import IngestOptions, ingest_recordings
+from semdb.settings import Settings
+from tests.integration.comparison import rows_per_table
+from tests.rooms import COMMAND, environment
+
+KEYFRAMES = 8
+# What a second run of the same ingest may change: when it happened, and ids of rows that were rolled back.
+NOT_COMPARED = {"created_at", "finished_at", "changed_at", "lease_until", "worker", "attempts"}
+
+
+def settings(url: str) -> Settings:
+    return Settings(database_url=url, detector="recorded", encoder="gist", features="surf", threads=1)
+
+
+def dump(store: Store) -> dict[str, list[tuple[Any, ...]]]:
+    """All rows of all tables but times, sorted; blobs whole."""
+    found = {}
+    with store.engine.connect() as connection:
+        for table in tables.metadata.sorted_tables:
+            columns = [column for column in table.columns if column.name not in NOT_COMPARED]
+            found[table.name] = sorted(map(tuple, connection.execute(select(*columns))), key=repr)
+    return found
+
+
+def test_ingest_stores_what_it_says_and_again_adds_nothing(room: Path, database_url: str) -> None:
+    [summary] = ingest_recordings([room], settings(database_url), IngestOptions(keyframes=KEYFRAMES))
+    assert (summary.total_frames, summary.usable_frames, summary.planned, summary.stored) == (
+        24,
+        24,
+        KEYFRAMES,
+        KEYFRAMES,
+    )
+    assert summary.failed == {}
+    with open_store(database_url) as store:
+        before = dump(store)
+        rows = rows_per_table(store)
+        assert rows["keyframes"] == rows["keyframe_images"] == rows["cnn_vectors"] == rows["keypoints"] == KEYFRAMES
+        assert rows["objects"] == summary.objects > 2 * KEYFRAMES
+        assert summary.keypoints > 100 * KEYFRAMES
+        [status] = store.status()
+        assert (status.state, status.keypoints) == ("complete", summary.keypoints)
+    [again] = ingest_recordings([room], settings(database_url), IngestOptions(keyframes=KEYFRAMES))
+    [resumed] = ingest_recordings([room], settings(database_url))
+    assert (again.stored, again.already_stored) == (0, KEYFRAMES)
+    assert (resumed.stored, resumed.planned) == (0, KEYFRAMES)
+    with open_store(database_url) as store:
+        assert dump(store) == before
+
+
+def test_both_servers_hold_equal_rows(room: Path, tmp_path: Path, mariadb_url: str) -> None:
+    from semdb.database import schema
+    from semdb.database.engine import make_engine
+
+    urls = [f"sqlite:///{tmp_path / 'one.sqlite3'}", mariadb_url]
+    dumps = []
+    for url in urls:
+        engine = make_engine(url)
+        schema.upgrade(engine)
+        engine.dispose()
+        ingest_recordings([room], settings(url), IngestOptions(keyframes=KEYFRAMES))
+        with open_store(url) as store:
+            dumps.append(dump(store))
+    assert dumps[0].keys() == dumps[1].keys()
+    for name, rows in dumps[0].items():
+        assert rows == dumps[1][name], name
+
+
+def content(store: Store) -> dict[str, list[tuple[Any, ...]]]:
+    """Rows of keyframes as values, free of ids: what a cut-off run has to end with."""
+    from semdb.database.codecs import encode_array
+
+    found: dict[str, list[tuple[Any, ...]]] = {"frames": []}
+    map_id = store.maps()[0].id
+    for stored in store.load_keyframes(store.keyframe_ids(map_id)):
+        vector = store.load_vectors([stored.id])[0]
+        objects = tuple(
+            (o.ordinal, o.category, o.score, o.box.tobytes(), o.geometry.pixel_area) for o in stored.objects
+        )
+        image = store.load_image(stored.id)
+        features = stored.keypoints.features
+        arrays = (vector, features.xy, features.descriptors, stored.keypoints.points, stored.keypoints.object_index)
+        blobs = tuple(encode_array(array) for array in arrays)
+        found["frames"].append((stored.frame_index, stored.timestamp_ns, objects, image.rgb, image.depth, *blobs))
+    found["frames"].sort(key=lambda row: row[0])
+    found["counts"] = sorted(rows_per_table(store).items())
+    return found
+
+
+@pytest.mark.parametrize(("sent", "code"), [(signal.SIGKILL, -signal.SIGKILL), (signal.SIGINT, 130)])
+def test_cut_off_and_run_again_ends_with_the_same_rows(
+    room: Path, database_url: str, tmp_path: Path, sent: signal.Signals, code: int
+) -> None:
+    undisturbed = f"sqlite:///{tmp_path / 'undisturbed.sqlite3'}"
+    ingest_recordings([room], settings(undisturbed), IngestOptions(keyframes=KEYFRAMES))
+    command = [*COMMAND, "ingest", str(room), "--keyframes", str(KEYFRAMES)]
+    specs = {"SEMDB_DETECTOR": "recorded", "SEMDB_ENCODER": "gist", "SEMDB_FEATURES": "surf"}
+    interrupted = 0
+    for wanted in (2, 5):
+        process = subprocess.Popen(
+            command, env=environment(database_url, **specs), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        if wait_for_keyframes(database_url, wanted, process):
+            os.kill(process.pid, sent)
+            interrupted += int(process.wait(60) == code)
+        else:
+            process.wait(60)
+    assert interrupted >= 1, "the ingest was never cut off: the test tests nothing"
+    [summary] = ingest_recordings([room], settings(database_url), IngestOptions(keyframes=KEYFRAMES))
+    assert summary.already_stored + summary.stored == KEYFRAMES
+    with open_store(undisturbed) as expected, open_store(database_url) as store:
+        assert content(store) == content(expected)
+
+
+def wait_for_keyframes(url: str, count: int, process: subprocess.Popen[bytes]) -> bool:
+    """Whether the process still ran when `count` keyframes were stored."""
+    with open_store(url) as store:
+        while process.poll() is None:
+            if rows_per_table(store)["keyframes"] >= count:
+                return process.poll() is None
+            time.sleep(0.005)
+    return False
+
+
+def test_a_broken_keyframe_fails_and_the_rest_goes_on(room: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "broken"
+    shutil.copytree(room, copy)
+    url = f"sqlite:///{tmp_path / 'broken.sqlite3'}"
+    first = sorted((copy / "rgb").iterdir())[8]
+    data = bytearray(first.read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 400] = bytes(400)  # header and end are whole: only decoding can tell
+    first.write_bytes(data)
+    [summary] = ingest_recordings([copy], settings(url), IngestOptions(stride=4))
+    assert list(summary.failed) == [8]
+    assert first.name in summary.failed[8]
+    assert summary.stored == 5
+    with open_store(url) as store:
+        [item] = store.failed_items()
+        assert (item.frame_index, first.name in item.error) == (8, True)
+    first.write_bytes((room / "rgb" / first.name).read_bytes())
+    [again] = ingest_recordings([copy], settings(url), IngestOptions(stride=4))
+    assert (again.stored, again.already_stored, again.failed) == (1, 5, {})
+
+
+def test_other_models_and_other_plans_are_refused(room: Path, tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'one.sqlite3'}"
+    ingest_recordings([room], settings(url), IngestOptions(keyframes=3, map_name="m"))
+    with pytest.raises(ProvenanceError, match=r"surf.*sift|sift.*surf"):
+        ingest_recordings([room], settings(url).model_copy(update={"features": "sift"}), IngestOptions(map_name="m"))
+    with pytest.raises(UsageError, match="semdb delete"):
+        ingest_recordings([room], settings(url), IngestOptions(keyframes=4, map_name="m"))
+    with open_store(url) as store:
+        assert rows_per_table(store)["keyframes"] == 3

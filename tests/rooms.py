@@ -1,0 +1,46 @@
+"""A small rendered room for tests, and commands run as a person would."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from semdb.recordings.synthetic import SyntheticOptions, write_synthetic_recording
+
+SMALL = SyntheticOptions(frames=24, width=320, height=240, lap_frames=80)
+COMMAND = [sys.executable, "-m", "semdb.cli.main"]
+
+
+def render(directory: Path, options: SyntheticOptions = SMALL) -> Path:
+    write_synthetic_recording(directory, options)
+    return directory
+
+
+def environment(database_url: str, **settings: str) -> dict[str, str]:
+    """The environment of a command: nothing of SEMDB_ but what is given."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("SEMDB_")}
+    return {**kept, "SEMDB_DATABASE_URL": database_url, "SEMDB_THREADS": "1", **settings}
+
+
+def semdb(*arguments: object, url: str, cwd: Path | None = None, **settings: str) -> subprocess.CompletedProcess[str]:
+    """Runs ``semdb ARGUMENTS`` in a process of its own."""
+    return subprocess.run(
+        [*COMMAND, *map(str, arguments)],
+        env=environment(url, **settings),
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+
+
+def semdb_json(*arguments: object, url: str, **settings: str) -> Any:
+    """What a command prints as JSON; fails with its stderr when it fails."""
+    done = semdb(*arguments, url=url, **settings)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
