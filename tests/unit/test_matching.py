@@ -1,0 +1,108 @@
+"""Descriptor matching: mutual, ratio, classes as evidence, guided."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from semdb.localization.matching import (
+    Evidence,
+    MatchingOptions,
+    match_guided,
+    match_keypoints,
+    squared_distances,
+)
+
+RANDOM = np.random.default_rng(0)
+
+
+def unit_rows(count: int, width: int = 64) -> np.ndarray:
+    rows = RANDOM.normal(size=(count, width))
+    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+
+
+def background(count: int) -> np.ndarray:
+    return np.full(count, -1, np.int32)
+
+
+def test_distances_of_unit_vectors_and_of_bits() -> None:
+    a, b = unit_rows(5), unit_rows(7)
+    expected = ((a[:, None] - b[None]) ** 2).sum(axis=2)
+    np.testing.assert_allclose(squared_distances(a, b), expected, atol=1e-5)
+    bits = RANDOM.integers(0, 256, (4, 32), dtype=np.uint8)
+    other = bits.copy()
+    other[0, 0] ^= 0b101
+    assert squared_distances(bits, other)[0, 0] == 2
+    assert squared_distances(bits, other)[1, 1] == 0
+
+
+def test_a_shuffled_copy_is_found_again() -> None:
+    query = unit_rows(200)
+    order = RANDOM.permutation(200)
+    matches = match_keypoints(query, query[order], background(200), background(200))
+    assert len(matches) == 200
+    np.testing.assert_array_equal(order[matches.keyframe], matches.query)
+    assert not matches.same_class.any()
+
+
+def test_nothing_to_match() -> None:
+    assert len(match_keypoints(unit_rows(0), unit_rows(5), background(0), background(5))) == 0
+    assert len(match_keypoints(unit_rows(5), unit_rows(0), background(5), background(0))) == 0
+    assert len(match_keypoints(unit_rows(1), unit_rows(1), background(1), background(1))) <= 1
+
+
+def test_repeated_texture_fails_the_ratio_unless_the_class_decides() -> None:
+    """The same pattern on a cup and on the wall: only among keypoints on cups is it unique."""
+    pattern = unit_rows(1)
+    other = unit_rows(6)
+    query = np.vstack([pattern, other[:3]])
+    keyframe = np.vstack([pattern + 0.01 * unit_rows(1), pattern + 0.01 * unit_rows(1), other[3:]])
+    query_classes = np.array([0, 0, -1, -1], np.int32)
+    keyframe_classes = np.array([0, -1, 0, 0, -1], np.int32)
+    unaware = match_keypoints(query, keyframe, background(4), background(5))
+    aware = match_keypoints(query, keyframe, query_classes, keyframe_classes)
+    assert 0 not in unaware.query
+    pairs = list(zip(aware.query.tolist(), aware.keyframe.tolist(), strict=True))
+    assert (0, 0) in pairs
+    assert aware.same_class[pairs.index((0, 0))]
+
+
+def test_contradicting_classes_need_a_better_match() -> None:
+    query = unit_rows(1)
+    near = query + 0.08 * unit_rows(1)
+    far = query + 0.1 * unit_rows(1)  # ratio of distances about 0.8: between the two limits
+    keyframe = np.vstack([near, far]).astype(np.float32)
+    keyframe /= np.linalg.norm(keyframe, axis=1, keepdims=True)
+    first, second = sorted(np.sqrt(squared_distances(query, keyframe)[0]))
+    assert 0.75 < first / second < 0.85
+    table, cup, wall = np.array([0], np.int32), np.array([1, 1], np.int32), background(2)
+    assert len(match_keypoints(query, keyframe, table, wall)) == 1
+    assert len(match_keypoints(query, keyframe, table, cup)) == 0
+
+
+def test_objects_only_never_leaves_the_class() -> None:
+    query = unit_rows(60)
+    classes = np.array([0, 1, -1] * 20, np.int32)
+    options = MatchingOptions(evidence=Evidence.OBJECTS)
+    matches = match_keypoints(query, query, classes, classes, options)
+    assert len(matches) == 40
+    assert (classes[matches.query] == classes[matches.keyframe]).all()
+    assert (classes[matches.query] >= 0).all()
+
+
+@pytest.mark.parametrize("kind", ["float32", "uint8"])
+def test_guided_matching_looks_near_the_projection_only(kind: str) -> None:
+    descriptors = unit_rows(50) if kind == "float32" else RANDOM.integers(0, 256, (50, 32), dtype=np.uint8)
+    xy = RANDOM.uniform(0, 600, (50, 2))
+    repeated = np.concatenate([descriptors, descriptors])  # everything is there twice, once 300 px away
+    twice_xy = np.concatenate([xy, xy + 300.0])
+    shifted = xy + 3.0
+    classes = background(50)
+    matches = match_guided(repeated, descriptors, twice_xy, shifted, background(100), classes)
+    found = dict(zip(matches.keyframe.tolist(), matches.query.tolist(), strict=True))
+    assert len(found) >= 45
+    assert all(found[k] == k for k in found)
+    nowhere = np.full((50, 2), np.nan)
+    assert len(match_guided(repeated, descriptors, twice_xy, nowhere, background(100), classes)) == 0
+    away = match_guided(repeated, descriptors, twice_xy, xy + 5000, background(100), classes)
+    assert len(away) == 0
