@@ -261,8 +261,8 @@ def _shade(kind, half, top, ftex, fuv, fmap, tint, texels, table, lightmap, i, f
 def cast(kind, half, top, tiles, ids, o, m, near, focal, cx, cy, depth, prims):
     """First pass: writes depth ``[H, W]`` (z of pixel centres, 0 for none) and prims (8 * primitive + face, or -1).
 
-    tiles ``[rows, cols, 2]``: ranges in `ids`. o ``[n, 3]``, m ``[n, 3, 3]``: camera centre and rotation in the frame of
-    each primitive. near ``[n, 5]``: its least depth, and the bounds x0, x1, y0, y1 of the rays that can hit it.
+    tiles ``[rows, cols, 2]``: ranges in `ids`. o ``[n, 3]``, m ``[n, 3, 3]``: camera centre and rotation in the frame
+    of each primitive. near ``[n, 5]``: its least depth, and the bounds x0, x1, y0, y1 of the rays that can hit it.
     """
     height, width = depth.shape
     for v in range(height):

@@ -122,7 +122,8 @@ def _write_all(folder: Path, sequence: SyntheticSequence, progress: Callable[[in
     for name in ("rgb", "depth", "masks"):
         (folder / name).mkdir()
     stems = [f"{sequence.timestamp(i):.6f}" for i in range(options.frames)]
-    with ThreadPoolExecutor(min(len(os.sched_getaffinity(0)), 8)) as pool:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    with ThreadPoolExecutor(min(cores, 8)) as pool:
         jobs = [pool.submit(_write_frame, folder, stems[i], sequence, i) for i in range(options.frames)]
         try:
             for done, job in enumerate(as_completed(jobs), 1):
