@@ -48,7 +48,7 @@ class Proposal:
     cosine: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True)
 class Batch:
     """Keyframes to match next, and how many distinct keyframes were ranked by cosine so far."""
 

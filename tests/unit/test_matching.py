@@ -57,6 +57,7 @@ def test_repeated_texture_fails_the_ratio_unless_the_class_decides() -> None:
     other = unit_rows(6)
     query = np.vstack([pattern, other[:3]])
     keyframe = np.vstack([pattern + 0.01 * unit_rows(1), pattern + 0.01 * unit_rows(1), other[3:]])
+    keyframe /= np.linalg.norm(keyframe, axis=1, keepdims=True)
     query_classes = np.array([0, 0, -1, -1], np.int32)
     keyframe_classes = np.array([0, -1, 0, 0, -1], np.int32)
     unaware = match_keypoints(query, keyframe, background(4), background(5))
