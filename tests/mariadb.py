@@ -95,7 +95,7 @@ def server() -> Iterator[TestServer]:
             "SEMDB_TEST_MYSQL_URL=mysql+pymysql://USER:PASSWORD@HOST/semdb_test"
         )
     # Not below pytest's own folder, which is closed to the server's user.
-    folder = Path(tempfile.mkdtemp(prefix="semdb-mariadb-", dir="/tmp"))
+    folder = Path(tempfile.mkdtemp(prefix="semdb-mariadb-", dir=_parent()))
     try:
         with _started(folder, str(programs["mariadbd"]), str(programs["mariadb-install-db"])) as started:
             yield started
@@ -154,6 +154,14 @@ def _started(folder: Path, mariadbd: str, install: str) -> Iterator[TestServer]:
     finally:
         process.kill()  # nothing in it is worth a clean shutdown
         process.wait()
+
+
+def _parent() -> str:
+    """Memory where there is enough of it: making and dropping tables is three times as fast there."""
+    memory = "/dev/shm"
+    if os.access(memory, os.W_OK) and shutil.disk_usage(memory).free > 2**30:
+        return memory
+    return "/tmp"
 
 
 def _server_user() -> str | None:

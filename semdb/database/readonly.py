@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 import sqlite3
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 from decimal import Decimal
 from typing import Any
 
@@ -33,7 +33,7 @@ _ALLOWED_ACTIONS = {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_F
 _DENIED_FUNCTIONS = {"load_extension", "fts3_tokenizer"}
 
 
-def run_readonly(settings: Settings, sql: str) -> tuple[tuple[str, ...], Iterator[Row]]:
+def run_readonly(settings: Settings, sql: str) -> tuple[tuple[str, ...], Generator[Row, None, None]]:
     """The column names and the rows of one read-only statement; close the iterator to end it early.
 
     Whole decimals of a server (its sums) come as int, others as float, as on SQLite. Raises UsageError when it is
@@ -58,7 +58,7 @@ def _check_statement(sql: str) -> None:
         raise UsageError(f"only queries can be run here ({', '.join(_FIRST_WORDS[:2])} ...), not {rest[:40]!r}")
 
 
-def _sqlite(settings: Settings, sql: str) -> Iterator[Row]:
+def _sqlite(settings: Settings, sql: str) -> Generator[Row, None, None]:
     path = sqlite_path(parse_url(settings.database_url))
     if path is None or not path.exists():
         raise SchemaError(f"there is no database {settings.database_url}: run `semdb init` or `semdb ingest` first")
@@ -99,7 +99,7 @@ def _too_slow(settings: Settings) -> DatabaseError:
     )
 
 
-def _server(settings: Settings, sql: str) -> Iterator[Row]:
+def _server(settings: Settings, sql: str) -> Generator[Row, None, None]:
     if not settings.reader_url:
         raise UsageError(
             "on a server this needs an account that may only read: set SEMDB_READER_URL to its URL; "
@@ -115,7 +115,7 @@ def _server(settings: Settings, sql: str) -> Iterator[Row]:
         engine.dispose()
 
 
-def _server_rows(engine: Engine, settings: Settings, sql: str) -> Iterator[Row]:
+def _server_rows(engine: Engine, settings: Settings, sql: str) -> Generator[Row, None, None]:
     import pymysql
     from pymysql.cursors import SSCursor
 
@@ -126,20 +126,24 @@ def _server_rows(engine: Engine, settings: Settings, sql: str) -> Iterator[Row]:
     connection = pooled.driver_connection
     try:
         _prepare(connection, settings.sql_time_limit_s, safe_url(engine.url))
-        with connection.cursor(SSCursor) as cursor:  # type: ignore[union-attr]
-            cursor.execute(sql)
-            if cursor.description is None:
-                raise UsageError("the statement gives no rows")
-            yield tuple(column[0] for column in cursor.description)
-            while rows := cursor.fetchmany(FETCH):
-                yield from (tuple(map(_plain, row)) for row in rows)
+        cursor = connection.cursor(SSCursor)  # type: ignore[union-attr]
+        cursor.execute(sql)
+        if cursor.description is None:
+            raise UsageError("the statement gives no rows")
+        yield tuple(column[0] for column in cursor.description)
+        while rows := cursor.fetchmany(FETCH):
+            yield from (tuple(map(_plain, row)) for row in rows)
     except pymysql.err.MySQLError as error:
         code = error.args[0] if error.args else None
         if code in (1969, 3024, 2013):  # MariaDB's and MySQL's own limits; the driver's
             raise _too_slow(settings) from error
         raise DatabaseError(f"the database refused the statement: {error}") from error
     finally:
-        pooled.invalidate()  # rows may be unread: the connection is not for others
+        # The driver reads the rest of a result before it closes, which may be hours of rows: close at once instead.
+        result = getattr(connection, "_result", None)
+        if result is not None:
+            result.unbuffered_active = False
+        pooled.invalidate()
         pooled.close()
 
 

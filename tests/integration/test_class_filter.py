@@ -1,0 +1,133 @@
+"""The class-attribute filter against the same sums in plain Python, and the same to the last bit on every server."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from semdb.database import schema
+from semdb.database.class_filter import SCALE, class_weight, class_weights
+from semdb.database.engine import make_engine
+from semdb.database.records import ScoredKeyframe
+from semdb.database.store import Store, open_store
+from semdb.errors import UsageError
+from tests.database_samples import CATEGORIES, MODELS, description, fill, plan, record
+
+SHOWN = (
+    ["chair", "chair", "cup"],
+    ["chair"],
+    ["cup", "laptop"],
+    [],
+    ["cup"] * 5,
+    ["person", "chair", "cup", "laptop", "tv"],
+)
+
+
+@pytest.fixture
+def filled(store: Store) -> tuple[int, list[int]]:
+    return _fill(store)
+
+
+def _fill(store: Store) -> tuple[int, list[int]]:
+    map_id = store.ensure_map("room")
+    planned = store.plan_recording(map_id, plan("r", range(len(SHOWN))), MODELS)
+    ids = [
+        store.write_keyframe(planned.recording_id, record(i, description(i, shown, keypoints=3))).keyframe_id
+        for i, shown in enumerate(SHOWN)
+    ]
+    fill(store, "another map", seed=77)  # never to be seen
+    return map_id, ids
+
+
+def _expected(counts: dict[str, float], ids: list[int]) -> list[ScoredKeyframe]:
+    """The formula of the module's docstring in floating point."""
+    total = len(SHOWN)
+
+    def idf(name: str) -> float:
+        return math.log((1 + total) / (1 + sum(name in shown for shown in SHOWN))) + 1
+
+    whole = sum(idf(name) * wanted for name, wanted in counts.items())
+    scored = []
+    for key, shown in zip(ids, SHOWN, strict=True):
+        have = Counter(shown)
+        score = sum(idf(name) * min(wanted, have[name]) for name, wanted in counts.items()) / whole
+        if score > 0:
+            scored.append(ScoredKeyframe(key, score))
+    return sorted(scored, key=lambda item: (-round(item.class_score, 5), item.keyframe_id))
+
+
+@pytest.mark.parametrize(
+    "counts",
+    [
+        {"chair": 1.0},
+        {"chair": 2.0, "cup": 1.0},
+        {"cup": 3.0, "laptop": 1.0, "zebra": 2.0},
+        {"chair": 0.4, "cup": 2.5, "tv": 0.0},
+        dict.fromkeys(CATEGORIES, 1.0),
+    ],
+)
+def test_scores_are_those_of_the_formula(store: Store, filled: tuple[int, list[int]], counts: dict[str, float]) -> None:
+    map_id, ids = filled
+    expected = _expected(counts, ids)
+    scored = store.class_scores(map_id, counts)
+    assert [item.keyframe_id for item in scored] == [item.keyframe_id for item in expected]
+    np.testing.assert_allclose(
+        [item.class_score for item in scored], [item.class_score for item in expected], atol=2e-6
+    )
+    half = store.class_filter(map_id, counts, 0.5)
+    assert half == [item for item in scored if item.class_score >= 0.5]
+
+
+def test_the_best_keyframe_has_everything(store: Store, filled: tuple[int, list[int]]) -> None:
+    map_id, ids = filled
+    (best,) = store.class_filter(map_id, {"chair": 1, "cup": 1, "laptop": 1, "tv": 1}, 1.0)
+    assert best == ScoredKeyframe(ids[5], 1.0)
+    full = store.class_filter(map_id, {"cup": 1}, 1.0)  # four equal scores, by id
+    assert full == [ScoredKeyframe(ids[i], 1.0) for i in (0, 2, 4, 5)]
+
+
+def test_nothing_shared_is_nothing_found(store: Store, filled: tuple[int, list[int]]) -> None:
+    map_id, _ = filled
+    assert store.class_scores(map_id, {}) == []
+    assert store.class_scores(map_id, {"zebra": 3}) == []
+    assert store.class_scores(map_id, {"potted plant": 1}) == []
+    assert store.class_scores(store.ensure_map("empty"), {"chair": 1}) == []
+    assert store.class_filter(map_id, {"chair": 1, "zebra": 9}, 0.5) == []
+    for bad in (-1.0, math.nan, math.inf):
+        with pytest.raises(UsageError, match="count of the class 'chair'"):
+            store.class_scores(map_id, {"chair": bad})
+
+
+def test_rare_classes_weigh_more(store: Store, filled: tuple[int, list[int]]) -> None:
+    map_id, _ = filled
+    weights = {w.wanted: w for w in class_weights(store.engine, map_id, {"chair": 1, "tv": 2, "zebra": 3})}
+    chair, tv, zebra = weights[1], weights[2], weights[3]
+    assert chair.per_object == round(SCALE * (math.log(7 / 4) + 1)) == chair.full
+    assert tv.per_object == round(SCALE * (math.log(7 / 2) + 1))
+    assert zebra.category_id is None
+    assert zebra.per_object == round(SCALE * (math.log(7) + 1))
+    assert chair.per_object < tv.per_object < zebra.per_object
+    assert class_weight(1, 1.0, 0, 0).per_object == SCALE
+
+
+def test_scores_are_equal_to_the_last_bit_on_both_servers(tmp_path: Path, mariadb_url: str) -> None:
+    rng = np.random.default_rng(3)
+    queries = [
+        {str(name): float(count) for name, count in zip(CATEGORIES, rng.uniform(0, 3, 6).round(2), strict=True)}
+        for _ in range(20)
+    ]
+    answers = []
+    for url in (f"sqlite:///{tmp_path / 'a.sqlite3'}", mariadb_url):
+        engine = make_engine(url)
+        schema.upgrade(engine)
+        engine.dispose()
+        with open_store(url) as store:
+            map_id, _ = _fill(store)
+            fill(store, "room", "more", range(30), seed=200)
+            answers.append([store.class_filter(map_id, query, 0.3) for query in queries])
+    assert answers[0] == answers[1]
+    assert sum(map(len, answers[0])) == 146

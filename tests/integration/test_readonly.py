@@ -1,0 +1,282 @@
+"""`semdb sql` and the accounts: reading works, and the database itself refuses everything else."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from sqlalchemy import text
+from sqlalchemy.engine import make_url
+
+from semdb.database import accounts, schema
+from semdb.database.engine import make_engine
+from semdb.database.readonly import excess_rights, run_readonly
+from semdb.database.store import Store, open_store
+from semdb.errors import DatabaseError, SchemaError, UsageError
+from semdb.settings import Settings
+from tests.database_samples import MODELS, description, fill, plan, record
+from tests.mariadb import TestServer
+
+WRITES = [
+    "CREATE TABLE stolen (id INTEGER)",
+    "INSERT INTO maps (name) VALUES ('x')",
+    "UPDATE maps SET name = 'x'",
+    "DELETE FROM maps",
+    "DROP TABLE maps",
+    "REPLACE INTO maps (id, name) VALUES (1, 'x')",
+    "WITH x AS (SELECT 1) DELETE FROM maps",
+    "EXPLAIN SELECT 1; DELETE FROM maps",
+    "SELECT 1; DELETE FROM maps",
+    "SELECT 1; CREATE TABLE stolen (id INTEGER)",
+    "/* SELECT */ DELETE FROM maps",
+    "-- SELECT\nDELETE FROM maps",
+    "(DELETE FROM maps)",
+    "COMMIT",
+    "ROLLBACK",
+    "SET SESSION TRANSACTION READ WRITE",
+    "CALL mysql.anything()",
+    "GRANT ALL ON *.* TO me",
+    "LOAD DATA INFILE '/etc/passwd' INTO TABLE maps",
+    "VACUUM",
+    "VACUUM INTO '{folder}/copy'",
+    "ATTACH DATABASE '{folder}/attached' AS other",
+    "PRAGMA user_version = 7",
+    "PRAGMA query_only = OFF",
+    "PRAGMA writable_schema = ON",
+    "SELECT * FROM pragma_table_info('maps')",
+    "SELECT load_extension('{folder}/x')",
+    "SELECT name FROM maps INTO OUTFILE '{folder}/outfile'",
+    "SELECT name FROM maps LIMIT 1 INTO DUMPFILE '{folder}/dumpfile'",
+    "SELECT * FROM maps FOR UPDATE",
+    "SET STATEMENT max_statement_time = 0 FOR SELECT 1",
+    "/*!50000 SET GLOBAL max_connections = 1 */",
+    "/*M!100100 DELETE FROM maps */",
+    "SELECT 1 /*! INTO OUTFILE '{folder}/hidden' */",
+    "",
+    ";",
+]
+
+
+@contextlib.contextmanager
+def reader_of(server: TestServer, url: str, *extra: str) -> Iterator[str]:
+    """The URL of a reader account that `semdb init --accounts` would make, with more rights where given."""
+    made = accounts.plan_accounts(url, names={role: f"{role}_{id(server) % 10**6}" for role in accounts.ROLES})
+    names = [str(make_url(account).username) for account in made.urls.values()]
+    accounts.execute(url, made.statements)
+    try:
+        server.execute(*(right.format(account=f"'{names[2]}'@'%'") for right in extra))
+        yield made.urls["reader"]
+    finally:
+        server.execute(*(f"DROP USER IF EXISTS '{name}'@'%'" for name in names))
+
+
+@pytest.fixture
+def open_folder() -> Iterator[Path]:
+    """A folder that the server's user could write into, which one below pytest's own is not."""
+    with tempfile.TemporaryDirectory(dir="/tmp") as name:
+        os.chmod(name, 0o777)
+        yield Path(name)
+
+
+@pytest.fixture
+def settings(store: Store, database_url: str, request: pytest.FixtureRequest) -> Iterator[Settings]:
+    """Settings as `semdb sql` has them, with data in the database."""
+    fill(store)
+    if store.engine.dialect.name == "sqlite":
+        yield Settings(database_url=database_url, sql_time_limit_s=20)
+        return
+    with reader_of(request.getfixturevalue("mariadb_server"), database_url) as reader:
+        yield Settings(database_url=database_url, reader_url=reader, sql_time_limit_s=20)
+
+
+def test_queries_give_columns_and_rows(settings: Settings) -> None:
+    columns, rows = run_readonly(
+        settings, "SELECT map, SUM(keypoints) AS total, 'a%b;' AS text FROM keypoint_counts GROUP BY map;"
+    )
+    assert columns == ("map", "total", "text")
+    assert list(rows) == [("room", 300, "a%b;")]
+    _, rows = run_readonly(settings, "-- comment\n/* another */ SELECT 1.5, NULL, -2")
+    assert list(rows) == [(1.5, None, -2)]
+    _, rows = run_readonly(
+        settings,
+        "WITH RECURSIVE n AS (SELECT 1 AS i UNION ALL SELECT i + 1 FROM n WHERE i < 900) SELECT i FROM n ORDER BY i",
+    )
+    assert [i for (i,) in rows] == list(range(1, 901))
+    _, rows = run_readonly(settings, "SELECT rgb FROM keyframe_images ORDER BY keyframe_id")
+    assert next(rows)[0] == record(0, description(0)).image_bytes
+    rows.close()
+
+
+def test_rows_are_fetched_as_they_are_asked_for(settings: Settings) -> None:
+    forever = "WITH RECURSIVE n AS (SELECT 1 AS i UNION ALL SELECT i + 1 FROM n WHERE i < 3000000) SELECT i FROM n"
+    if "mysql" in settings.database_url:
+        forever = "SELECT a.id FROM objects a, objects b, objects c, objects d, objects e"
+    _, rows = run_readonly(settings, forever)
+    assert isinstance(next(rows)[0], int)
+    rows.close()
+
+
+@pytest.mark.parametrize("checked", [True, False], ids=["with the check of the first word", "by the database alone"])
+def test_whatever_is_not_reading_is_refused(
+    settings: Settings, store: Store, open_folder: Path, checked: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not checked:
+        monkeypatch.setattr("semdb.database.readonly._check_statement", lambda _: None)
+    server = store.engine.dialect.name != "sqlite"
+    before = _state(store)
+    passed = set()
+    for statement in WRITES:
+        try:
+            list(run_readonly(settings, statement.format(folder=open_folder))[1])
+            passed.add(statement)
+        except (DatabaseError, UsageError):
+            pass
+        assert _state(store) == before, statement
+        assert list(open_folder.iterdir()) == [], statement
+    # What passes changes nothing that outlives its connection: a lock until the end, a limit of its own, a comment.
+    harmless = {"SELECT * FROM maps FOR UPDATE"} if server else {"SELECT 1 /*! INTO OUTFILE '{folder}/hidden' */"}
+    if server and not checked:
+        harmless |= {"SET STATEMENT max_statement_time = 0 FOR SELECT 1"}
+    assert passed <= harmless
+    _, rows = run_readonly(settings, "SELECT name FROM maps")
+    assert list(rows) == [("room",)]
+
+
+def _state(store: Store) -> object:
+    query = "SELECT COUNT(*), MIN(name), MAX(name) FROM maps"
+    tables = "SELECT COUNT(*) FROM sqlite_master"
+    if store.engine.dialect.name != "sqlite":
+        tables = "SELECT COUNT(*) FROM information_schema.tables WHERE table_schema = DATABASE()"
+    with store.engine.connect() as connection:
+        return [tuple(connection.execute(text(statement)).one()) for statement in (query, tables)]
+
+
+def test_slow_queries_are_ended(settings: Settings) -> None:
+    hurried = settings.model_copy(update={"sql_time_limit_s": 0.3})
+    slow = "SELECT COUNT(*) FROM objects a, objects b, objects c, objects d, objects e, objects f, objects g, objects h"
+    began = time.monotonic()
+    with pytest.raises(DatabaseError, match=r"longer than 0\.3 s .*SEMDB_SQL_TIME_LIMIT_S"):
+        list(run_readonly(hurried, slow)[1])
+    assert time.monotonic() - began < 15  # without the limit: hours
+
+
+def test_mistakes_are_told(settings: Settings) -> None:
+    with pytest.raises(DatabaseError, match=r"refused the statement.*no_such_table"):
+        run_readonly(settings, "SELECT * FROM no_such_table")
+    with pytest.raises(UsageError, match="only queries can be run here"):
+        run_readonly(settings, "DELETE FROM maps")
+
+
+def test_a_sqlite_file_that_is_not_there_is_not_made(tmp_path: Path) -> None:
+    with pytest.raises(SchemaError, match="no database"):
+        run_readonly(Settings(database_url=f"sqlite:///{tmp_path / 'a.sqlite3'}"), "SELECT 1")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_server_needs_a_reader(mariadb_url: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"SEMDB_READER_URL.*semdb init --accounts"):
+        run_readonly(Settings(database_url=mariadb_url, reader_url=None), "SELECT 1")
+    file = f"sqlite:///{tmp_path / 'a.sqlite3'}"
+    with pytest.raises(UsageError, match="names a SQLite file"):
+        run_readonly(Settings(database_url=mariadb_url, reader_url=file), "SELECT 1")
+
+
+@pytest.mark.parametrize(
+    ("grant", "named"),
+    [
+        ("GRANT FILE ON *.* TO {account}", "FILE"),
+        ("GRANT INSERT ON mysql.* TO {account}", "INSERT"),
+        ("GRANT ALL ON *.* TO {account}", "ALL PRIVILEGES"),
+        ("GRANT SELECT ON *.* TO {account} WITH GRANT OPTION", "GRANT OPTION"),
+    ],
+)
+def test_an_account_that_may_do_more_is_refused(
+    mariadb_server: TestServer, mariadb_url: str, grant: str, named: str
+) -> None:
+    with reader_of(mariadb_server, mariadb_url, grant) as reader:
+        settings = Settings(database_url=mariadb_url, reader_url=reader)
+        with pytest.raises(DatabaseError, match=f"may do more than read .*{named}") as caught:
+            run_readonly(settings, "SELECT 1")
+    assert str(make_url(reader).password) not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("line", "extra"),
+    [
+        ("GRANT USAGE ON *.* TO `r`@`%` IDENTIFIED BY PASSWORD '*AB'", []),
+        ("GRANT SELECT, SHOW VIEW ON `semdb`.* TO `r`@`%`", []),
+        ("GRANT SELECT (`id`, `name`), UPDATE (`a`, `b`) ON `s`.`t` TO `r`@`%`", ["UPDATE"]),
+        ("GRANT SELECT, FILE ON *.* TO `r`@`%`", ["FILE"]),
+        ("GRANT SELECT ON `s`.* TO `r`@`%` WITH GRANT OPTION", ["GRANT OPTION"]),
+        ("GRANT USAGE ON *.* TO `r`@`%` WITH MAX_USER_CONNECTIONS 2", []),
+        ("GRANT `writers`@`%` TO `r`@`%`", ["`writers`@`%` (a role or proxy)"]),
+        ("GRANT EXECUTE ON PROCEDURE `s`.`p` TO `r`@`%`", ["EXECUTE ON PROCEDURE `s`.`p` (a role or proxy)"]),
+    ],
+)
+def test_grants_are_read(line: str, extra: list[str]) -> None:
+    assert excess_rights(line) == extra
+
+
+def test_each_account_can_do_its_work_and_no_more(mariadb_server: TestServer, mariadb_url: str) -> None:
+    names = {role: f"acc_{role}" for role in accounts.ROLES}
+    secret = "it's %d & <odd>"
+    made = accounts.plan_accounts(mariadb_url, names=names, passwords={"owner": secret})
+    assert make_url(made.urls["owner"]).password == secret
+    assert len({make_url(url).password for url in made.urls.values()}) == 3
+    accounts.execute(mariadb_url, made.statements)
+    try:
+        owner = make_engine(made.urls["owner"])
+        schema.upgrade(owner)
+        schema.downgrade(owner)
+        schema.upgrade(owner)
+        owner.dispose()
+        with open_store(made.urls["writer"]) as store:
+            map_id, recording_id, ids = fill(store)
+            store.load_keyframes(ids)
+            planned = store.plan_recording(map_id, plan("second", [1]), MODELS)
+            assert store.write_keyframe(planned.recording_id, record(1, description(1))).created
+            store.delete_recording(recording_id)
+        writer = make_engine(made.urls["writer"])
+        with pytest.raises(DatabaseError, match="refuses"):
+            schema.downgrade(writer)
+        writer.dispose()
+        settings = Settings(database_url=made.urls["writer"], reader_url=made.urls["reader"])
+        assert list(run_readonly(settings, "SELECT keyframes FROM recording_summary")[1]) == [(1,)]
+        assert len(list(run_readonly(settings, "SELECT object_id FROM keyframe_objects")[1])) == len(
+            description(1).detections
+        )
+        with open_store(made.urls["reader"]) as store, pytest.raises(DatabaseError, match="refuses"):
+            store.ensure_map("x")
+        # the pattern characters in the schema's name are not patterns in the grants
+        other = mariadb_server.admin.set(database=str(make_url(mariadb_url).database).replace("_", "x"))
+        mariadb_server.execute(f"CREATE DATABASE `{other.database}`")
+        try:
+            stranger = make_url(made.urls["reader"]).set(database=other.database)
+            with pytest.raises(DatabaseError, match="refuses"):
+                open_store(stranger.render_as_string(hide_password=False))
+        finally:
+            mariadb_server.execute(f"DROP DATABASE `{other.database}`")
+        with pytest.raises(DatabaseError, match="acc_owner"):
+            accounts.execute(mariadb_url, made.statements)
+    finally:
+        mariadb_server.execute(*(f"DROP USER IF EXISTS '{name}'@'%'" for name in names.values()))
+
+
+def test_accounts_that_cannot_be_made(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="SQLite has no accounts"):
+        accounts.plan_accounts(f"sqlite:///{tmp_path / 'a.sqlite3'}")
+    url = "mysql+pymysql://root@127.0.0.1/semdb"
+    with pytest.raises(UsageError, match="cannot be the name of an account"):
+        accounts.plan_accounts(url, names={"reader": "x'; DROP TABLE maps; --"})
+    with pytest.raises(UsageError, match="no host for an account"):
+        accounts.plan_accounts(url, host="a'b")
+    with pytest.raises(UsageError, match="no backslash"):
+        accounts.plan_accounts(url, passwords={"owner": "a\\"})
+    made = accounts.plan_accounts(url, passwords=dict.fromkeys(accounts.ROLES, "p'w"))
+    assert made.statements[1] == "CREATE USER 'semdb_owner'@'%' IDENTIFIED BY 'p''w'"
+    assert made.statements[-1] == "GRANT SELECT, SHOW VIEW ON `semdb`.* TO 'semdb_reader'@'%'"

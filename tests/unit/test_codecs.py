@@ -1,0 +1,137 @@
+"""Blobs come back exactly, and whatever is wrong with one is an error that names the row."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from semdb.database.codecs import (
+    decode_array,
+    decode_keypoints,
+    decode_mask,
+    encode_array,
+    encode_keypoints,
+    encode_mask,
+    image_format,
+)
+from semdb.errors import CodecError
+from tests.database_samples import description
+
+DTYPES = ("<f4", "u1", "<f8", "<i4", "<u4")
+
+
+@given(
+    st.sampled_from(DTYPES).flatmap(
+        lambda dtype: hnp.arrays(dtype, hnp.array_shapes(min_dims=1, max_dims=3, min_side=0, max_side=9))
+    )
+)
+def test_arrays_come_back(array: npt.NDArray[Any]) -> None:
+    decoded = decode_array(encode_array(array), "here")
+    np.testing.assert_array_equal(decoded, array)
+    assert (decoded.dtype, decoded.shape) == (array.dtype, array.shape)
+
+
+@given(hnp.arrays(np.bool_, st.tuples(st.integers(0, 20), st.integers(0, 20))))
+def test_masks_come_back(mask: npt.NDArray[np.bool_]) -> None:
+    decoded = decode_mask(encode_mask(mask), "here")
+    np.testing.assert_array_equal(decoded, mask)
+    assert decoded.dtype == np.bool_
+    assert decoded.shape == mask.shape
+
+
+def test_the_layout_of_a_blob() -> None:
+    body = struct.pack("<I2f", 2, 1.0, -2.5)
+    assert (
+        encode_array(np.array([1.0, -2.5], ">f4"))
+        == b"SDBA\x01\x01\x01\x00" + struct.pack("<I", zlib.crc32(body)) + body
+    )
+    mask = np.zeros((2, 4), np.bool_)
+    mask[0, 2:] = mask[1, :1] = True
+    runs = struct.pack("<I5I", 5, 2, 4, 2, 3, 3)  # how many numbers, height, width, runs
+    assert encode_mask(mask) == b"SDBM\x01\x05\x01\x00" + struct.pack("<I", zlib.crc32(runs)) + runs
+
+
+def test_a_mask_is_small() -> None:
+    mask = np.zeros((480, 640), np.bool_)
+    mask[100:300, 200:400] = True
+    assert len(encode_mask(mask)) == 16 + 4 * (2 + 401)
+
+
+def test_arrays_of_other_kinds_are_refused() -> None:
+    for array in (np.zeros(2, np.float16), np.array(["a"]), np.zeros(2, np.complex64), np.array([None])):
+        with pytest.raises(CodecError, match=f"an array of {array.dtype}"):
+            encode_array(array)
+    with pytest.raises(CodecError, match="two dimensions, not 1"):
+        encode_mask(np.zeros(3, np.bool_))
+
+
+@given(st.integers(0, 200), st.integers(1, 255))
+def test_no_changed_byte_goes_unnoticed(position: int, difference: int) -> None:
+    blob = bytearray(encode_array(np.arange(40, dtype="<f4").reshape(8, 5)))
+    position %= len(blob)
+    if position == 7:  # the reserved byte
+        return
+    blob[position] ^= difference
+    with pytest.raises(CodecError, match="row 7"):
+        decode_array(bytes(blob), "row 7")
+
+
+def test_what_is_wrong_is_said() -> None:
+    good = encode_array(np.arange(6, dtype="<f4").reshape(2, 3))
+    cases = {
+        b"": "truncated \\(0 bytes\\)",
+        good[:-1]: "truncated \\(43 bytes.*needs 44\\)",
+        good + b"\0": "too long",
+        b"\x89PNG" + good[4:]: "not a blob of this kind",
+        good[:4] + b"\x02" + good[5:]: "blob format 2 is unknown.*upgrade",
+        good[:5] + b"\x63" + good[6:]: "dtype code 99",
+        good[:-1] + b"\x7f": "checksum",
+    }
+    for blob, message in cases.items():
+        with pytest.raises(CodecError, match=f"^vector 3: .*{message}"):
+            decode_array(blob, "vector 3")
+    with pytest.raises(CodecError, match="not a blob of this kind"):
+        decode_mask(good, "mask")
+    for numbers, message in (([2], "no size"), ([2, 2, 3], "do not fill 2x2"), ([1, 1, 5, 5], "do not fill")):
+        with pytest.raises(CodecError, match=message):
+            decode_mask(encode_array(np.array(numbers, "<u4"), magic=b"SDBM"), "mask")
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_keypoints_come_back(binary: bool) -> None:
+    keypoints = description(5, binary=binary).keypoints
+    blob = encode_keypoints(keypoints)
+    decoded = decode_keypoints(blob, keypoints.features.descriptors, keypoints.object_index, "here")
+    for name in ("xy", "size", "angle", "response", "laplacian", "descriptors"):
+        before, after = getattr(keypoints.features, name), getattr(decoded.features, name)
+        np.testing.assert_array_equal(after, before)
+        assert after.dtype == before.dtype
+        assert after.flags.c_contiguous
+    np.testing.assert_array_equal(decoded.points, keypoints.points)
+    np.testing.assert_array_equal(decode_array(blob, "here")[:, :2], keypoints.features.xy)
+    assert decode_keypoints(blob, None, keypoints.object_index, "here").features.descriptors.shape == (60, 0)
+
+
+def test_keypoints_that_do_not_belong_together_are_refused() -> None:
+    keypoints = description(5).keypoints
+    blob = encode_keypoints(keypoints)
+    with pytest.raises(CodecError, match=r"60 keypoints, descriptors \(59, 64\)"):
+        decode_keypoints(blob, keypoints.features.descriptors[1:], keypoints.object_index, "here")
+    with pytest.raises(CodecError, match="59 in object slices"):
+        decode_keypoints(blob, None, keypoints.object_index[1:], "here")
+    with pytest.raises(CodecError, match=r"float32 \[n, 9\], not float32 \(4, 8\)"):
+        decode_keypoints(encode_array(np.zeros((4, 8), np.float32)), None, np.zeros(4, np.int32), "here")
+
+
+def test_formats_are_told_by_their_first_bytes() -> None:
+    assert image_format(b"\x89PNG\r\n\x1a\n....") == "png"
+    assert image_format(b"\xff\xd8\xff\xe0....") == "jpeg"
+    assert image_format(b"P6 640 480") == image_format(None) == ""
