@@ -22,7 +22,7 @@ from semdb.errors import DatabaseError
 
 T = TypeVar("T")
 _answered: WeakSet[Engine] = WeakSet()  # engines that have had a connection
-ATTEMPTS = 8
+ATTEMPTS = 10
 FIRST_DELAY_S = 0.05
 LONGEST_DELAY_S = 3.0
 RETRIED_CODES = frozenset({1213, 1205, 2006, 2013, 1047})
