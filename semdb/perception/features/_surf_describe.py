@@ -237,17 +237,17 @@ def _sample(grey: Any, first: int, rows: int, columns: int, x: Any, y: Any, dx: 
 
 @kernel
 def _collect(means: Any, weights: Any, fields: Any, out: Any) -> None:
-    """64-d: sums of the weighted gradients dx, dy, |dx|, |dy| in 4x4 fields of 5x5. `fields` float32 [4, 20] is scratch."""
+    """64-d: sums of the weighted dx, dy, |dx|, |dy| in 4x4 fields of 5x5. `fields` float32 [4, 20] is scratch."""
     for row in range(4):
         for j in range(GRID):
             fields[0, j] = fields[1, j] = fields[2, j] = fields[3, j] = 0
         for i in range(row * 5, row * 5 + 5):
-            k, l = np.uintp(i * CELLS), np.uintp(i * GRID)
+            k, q = np.uintp(i * CELLS), np.uintp(i * GRID)
             for j in range(GRID):
                 x = np.uintp(j)
                 a, b = means[k + x], means[k + x + np.uintp(1)]
                 c, d = means[k + x + np.uintp(CELLS)], means[k + x + np.uintp(CELLS + 1)]
-                w = weights[l + x]
+                w = weights[q + x]
                 dx = ((b - a) + (d - c)) * w
                 dy = ((c - a) + (d - b)) * w
                 fields[0, j] += dx
@@ -255,11 +255,11 @@ def _collect(means: Any, weights: Any, fields: Any, out: Any) -> None:
                 fields[2, j] += abs(dx)
                 fields[3, j] += abs(dy)
         for field in range(4):
-            for q in range(4):
+            for part in range(4):
                 total = np.float32(0)
                 for j in range(5):
-                    total += fields[q, field * 5 + j]
-                out[(row * 4 + field) * 4 + q] = total
+                    total += fields[part, field * 5 + j]
+                out[(row * 4 + field) * 4 + part] = total
 
 
 @kernel

@@ -166,25 +166,33 @@ def _dense_row(
 def _candidate_flags(
     ring: Any, here: int, above: int, below: int, smaller: int, larger: int, n: int, threshold: Any, flags: Any
 ) -> None:
-    """flags[x] says whether ring[here + x] passes the threshold and its nearest six neighbours (offsets of rows)."""
+    """flags[x] says whether ring[here + x] passes the threshold and its nearest six neighbours (offsets of rows).
+
+    It must be above those before it (smaller, up, left) and not below those after it: of two equal samples, as around
+    a symmetric pattern that lies between two pixels, the first is kept; their parabola is the same.
+    """
     o, u, d, s, e = np.uintp(here), np.uintp(above), np.uintp(below), np.uintp(smaller), np.uintp(larger)
     left, right = np.uintp(here - 1), np.uintp(here + 1)
     for i in range(n):
         x = np.uintp(i)
         v = ring[o + x]
         flags[x] = (
-            (v > threshold) & (v > ring[left + x]) & (v > ring[right + x]) & (v > ring[u + x])
-            & (v > ring[d + x]) & (v > ring[s + x]) & (v > ring[e + x])
+            (v > threshold) & (v > ring[left + x]) & (v >= ring[right + x]) & (v > ring[u + x])
+            & (v >= ring[d + x]) & (v > ring[s + x]) & (v >= ring[e + x])
         )  # fmt: skip
 
 
 @kernel
 def _is_maximum(ring: Any, layer: int, up: int, mid: int, down: int, j: int) -> bool:
+    """Whether a sample is above all neighbours before it and not below all after it, in order of layer, row, column."""
     v = ring[layer, mid, j]
+    before = True
     for k in range(layer - 1, layer + 2):
         for row in (up, mid, down):
             for x in range(j - 1, j + 2):
-                if ring[k, row, x] >= v and not (k == layer and row == mid and x == j):
+                if k == layer and row == mid and x == j:
+                    before = False
+                elif ring[k, row, x] > v or (before and ring[k, row, x] == v):
                     return False
     return True
 

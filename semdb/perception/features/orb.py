@@ -9,6 +9,7 @@ from semdb.perception.features.opencv import check_image, extract_opencv, featur
 from semdb.types import BoolArray, Features, FloatArray, ImageArray, IntArray, ModelInfo
 
 SCALE_FACTOR = 1.2
+BORDER = 31  # pixels along the sides where OpenCV's ORB finds nothing
 
 
 class OrbFeatures:
@@ -30,6 +31,8 @@ class OrbFeatures:
         """
         check_image("orb", grey, mask)
         height, width = grey.shape
+        if min(height, width) <= 2 * BORDER:  # nothing can be found, and OpenCV fails on a level without pixels
+            grey = grey[:0]
 
         def position(xy: FloatArray, octave: IntArray) -> FloatArray:
             # OpenCV multiplies by the nominal scale only; a level is a resized image of a whole number of pixels,

@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from semdb.errors import UsageError
 from semdb.perception.features._surf_levels import CELL, level_keys, level_of
-from semdb.types import BoolArray, Features, Float32Array, ImageArray
+from semdb.types import BoolArray, Features, Float32Array, ImageArray, IntArray
 
 UPRIGHT_ANGLE = 270.0  # what OpenCV gives upright keypoints
 MASK_TILE = 16  # sample rows that share their columns to look at, when there is a mask
@@ -81,18 +81,18 @@ class SURF:
         With a `mask` [H, W], those whose centre lies on a pixel that is not zero: exactly the ones that the whole image
         has there, but only there is looked for them. Raises UsageError when image or mask are not of this kind.
         """
-        return self._describe(*self._detect(image, mask), described=True)
+        return self._describe(*self._detect(image, mask), described=True)[0]
 
     def detectAndCompute(  # noqa: N802
         self, image: ImageArray, mask: npt.NDArray[Any] | None = None
     ) -> tuple[tuple[cv2.KeyPoint, ...], Float32Array]:
         """Like `extract`: OpenCV keypoints (`class_id` holds the sign of the Laplacian) and float32 [n, 64 or 128]."""
-        features = self.extract(image, mask)
-        return _keypoints(features), features.descriptors.astype(np.float32, copy=False)
+        features, octaves = self._describe(*self._detect(image, mask), described=True)
+        return _keypoints(features, octaves), features.descriptors.astype(np.float32, copy=False)
 
     def detect(self, image: ImageArray, mask: npt.NDArray[Any] | None = None) -> tuple[cv2.KeyPoint, ...]:
         """The keypoints of `detectAndCompute`, without descriptors."""
-        return _keypoints(self._describe(*self._detect(image, mask), described=False))
+        return _keypoints(*self._describe(*self._detect(image, mask), described=False))
 
     def compute(
         self, image: ImageArray, keypoints: Sequence[cv2.KeyPoint]
@@ -105,8 +105,8 @@ class SURF:
         candidates = np.array(rows, dtype=np.float32).reshape(-1, 6)
         largest = max(self._largest, math.ceil(candidates[:, 2].max(initial=0)))
         order = np.argsort(-candidates[:, 3], kind="stable")
-        features = self._describe(self._integral(_checked(image), largest), candidates, order, described=True)
-        return _keypoints(features), features.descriptors.astype(np.float32, copy=False)
+        features, octaves = self._describe(self._integral(_checked(image), largest), candidates, order, described=True)
+        return _keypoints(features, octaves), features.descriptors.astype(np.float32, copy=False)
 
     def descriptorSize(self) -> int:  # noqa: N802
         return 128 if self.extended else 64
@@ -191,8 +191,8 @@ class SURF:
 
     def _describe(
         self, plane: _Plane, candidates: Float32Array, order: npt.NDArray[np.intp], *, described: bool
-    ) -> Features:
-        """Features of the candidates in the order given, without those whose orientation cannot be measured."""
+    ) -> tuple[Features, IntArray]:
+        """Features and octaves of the candidates in the order given, without those that have no orientation."""
         n = len(candidates)
         angles = np.full(n, UPRIGHT_ANGLE, np.float32)
         descriptors = np.empty((n if described else 0, self.descriptorSize()), np.float32)
@@ -202,7 +202,7 @@ class SURF:
             self._run(self._descriptor_tasks(plane, candidates, angles, descriptors))
         order = order[angles[order] >= 0]
         candidates = candidates[order]
-        return Features(
+        features = Features(
             xy=candidates[:, :2].copy(),
             size=candidates[:, 2].copy(),
             angle=angles[order],
@@ -210,6 +210,7 @@ class SURF:
             laplacian=candidates[:, 5].astype(np.int8),
             descriptors=descriptors[order] if described else descriptors,
         )
+        return features, candidates[:, 4].astype(np.int32)
 
     def _orient(self, plane: _Plane, candidates: Float32Array, angles: Float32Array) -> None:
         from semdb.perception.features._surf_describe import orient, orientation_weights
@@ -341,10 +342,7 @@ def _merged(spans: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     return np.stack((starts, stops), axis=1).astype(np.int64)
 
 
-def _keypoints(features: Features) -> tuple[cv2.KeyPoint, ...]:
-    return tuple(
-        cv2.KeyPoint(float(x), float(y), float(size), float(angle), float(response), 0, int(sign))
-        for (x, y), size, angle, response, sign in zip(
-            features.xy, features.size, features.angle, features.response, features.laplacian, strict=True
-        )
-    )
+def _keypoints(features: Features, octaves: IntArray) -> tuple[cv2.KeyPoint, ...]:
+    columns = (features.xy[:, 0], features.xy[:, 1], features.size, features.angle, features.response)
+    rows = zip(*(column.tolist() for column in (*columns, octaves, features.laplacian)), strict=True)
+    return tuple(cv2.KeyPoint(*row) for row in rows)
