@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import os
 import shutil
@@ -40,11 +41,16 @@ class SyntheticFrame:
     world_from_camera: FloatArray  # [4, 4]
 
 
+_first_visit = lru_cache(maxsize=2)(build_room)
+
+
 @lru_cache(maxsize=2)
 def _scene(room_seed: int, visit_seed: int | None) -> tuple[Room, PackedScene, tuple[int, ...]]:
     """The lit room of a first (`visit_seed` None) or second visit, and the labels of what was moved."""
-    room = build_room(room_seed)
-    moved = [] if visit_seed is None else move_objects(room, visit_seed, room_seed)
+    room, moved = _first_visit(room_seed), list[int]()
+    if visit_seed is not None:
+        room = copy.deepcopy(room)
+        moved = move_objects(room, visit_seed, room_seed)
     return room, bake_light(pack(room.items), _lamps(room)), tuple(moved)
 
 
