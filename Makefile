@@ -11,7 +11,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 LOCK := requirements/constraints.txt
-PYTEST_ARGS ?=
+# two processes: each starts a MariaDB of its own
+PYTEST_ARGS ?= --numprocesses 2
 
 .PHONY: help demo test unit lint services lock bench wheel clean
 
