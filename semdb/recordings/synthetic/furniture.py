@@ -22,7 +22,9 @@ class Palette:
         self.rng = rng
         woods = ((158, 112, 70), (196, 158, 112), (110, 72, 46), (216, 190, 152), (140, 100, 76))
         chosen = rng.permutation(len(woods))
-        self.wood = [self.repeat(textures.wood(rng, woods[k]), 0.7) for k in chosen[:3]]
+        grain = [textures.wood(rng, woods[k]) for k in chosen[:3]]
+        upright = [Texture(np.ascontiguousarray(np.rot90(g))) for g in grain]
+        self.wood = [Material(Texture(g), metres=0.7, upright=u) for g, u in zip(grain, upright, strict=True)]
         fabrics = [textures.fabric(rng, cloth_colour(rng), str(p)) for p in rng.permutation(textures.PATTERNS)]
         self.cloth = [self.repeat(f, 0.45) for f in fabrics]
         self.white = self.repeat(textures.speckle(rng, (222, 220, 214), 0.02), 0.5)

@@ -35,6 +35,7 @@ class Material:
     rect: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
     emissive: bool = False
+    upright: Texture | None = None  # taken instead by faces that are higher than wide: the grain of wood
 
     def moved(self, u: float, v: float) -> Material:
         """The same material from another place of its texture."""
@@ -195,13 +196,14 @@ def pack(items: Sequence[Item]) -> PackedScene:
         for f, ((w, h), material) in enumerate(zip(_face_sizes(prim), prim.faces, strict=True)):
             if w <= 0:
                 continue
-            key = id(material.texture)
+            texture = material.upright if material.upright is not None and h > 1.5 * w else material.texture
+            key = id(texture)
             if key not in known:
                 known[key] = len(textures)
-                textures.append(material.texture)
+                textures.append(texture)
             index[i, f] = known[key]
             u, v, du, dv = material.rect
-            ratio = material.texture.image.shape[1] / material.texture.image.shape[0]
+            ratio = texture.image.shape[1] / texture.image.shape[0]
             uv[i, f] = (u, v, w / material.metres / ratio, h / material.metres) if material.metres else (u, v, du, dv)
             tint[i, f] = material.tint
             if material.emissive:
