@@ -17,7 +17,7 @@ PYTEST_ARGS ?= --numprocesses 2
 .PHONY: help demo test unit lint services lock bench wheel clean
 
 help:
-	@sed -n 's/^# //p' Makefile
+	@sed -n 's/^# \(make \)/\1/p' Makefile
 
 # An environment that exists is kept; stamps say what was installed into it from which lock.
 $(BIN)/python:
