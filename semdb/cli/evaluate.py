@@ -72,7 +72,7 @@ def command(
     if report is not None:
         from semdb.evaluation.report import write_report
 
-        say(f"wrote {write_report(report, results, used_settings(settings, coarse, query_depth))}")
+        say(f"wrote {write_report(report, results, settings=used_settings(settings, coarse, query_depth))}")
 
 
 def parse_counts(text: str | None) -> list[int | None]:
