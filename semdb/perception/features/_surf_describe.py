@@ -164,36 +164,36 @@ def orient(sums: Any, pitch: int, pad: int, height: int, width: int, candidates:
 
 
 @kernel
-def smooth(sums: Any, pitch: int, pad: int, step: int, half: int, edge: float, margin: int, first: int,
-           rows: int, columns: int, out: Any) -> None:  # fmt: skip
+def smooth(sums: Any, pitch: int, pad: int, step: int, half: int, edge: float, margin: int,
+           top: int, rows: int, left: int, columns: int, out: Any) -> None:  # fmt: skip
     """Grey means around every `step`-th pixel: a box of 2 half + 1 pixels and a rim of one more with weight `edge`.
 
-    out[k * columns + l], k < rows, is the mean around the pixel ((first + k) * step - margin, l * step - margin).
+    out[k * columns + l] is the mean around the pixel ((top + k) * step - margin, (left + l) * step - margin).
     """
     taps = 2 * half + 1 + 2 * edge
     scale = 1.0 / (taps * taps)
     w00 = np.float32((1 - edge) * (1 - edge) * scale)
     w01 = np.float32((1 - edge) * edge * scale)
     w11 = np.float32(edge * edge * scale)
-    inner = np.empty(pitch, np.int32)
-    wide = np.empty(pitch, np.int32)
-    line = np.empty(pitch, np.float32)
-    left = pad - margin - half
-    i0, i1 = np.uintp(left), np.uintp(left + 2 * half + 1)
-    r0, r1 = np.uintp(left - 1), np.uintp(left + 2 * half + 2)
+    n = (columns - 1) * step + 1
+    inner = np.empty(n + 2 * half + 3, np.int32)
+    wide = np.empty(n + 2 * half + 3, np.int32)
+    line = np.empty(n, np.float32)
+    begin = pad + left * step - margin - half - 1
+    i0, i1, r1 = np.uintp(1), np.uintp(2 * half + 2), np.uintp(2 * half + 3)
     for k in range(rows):
-        y = pad + (first + k) * step - margin - half
-        a, b = np.uintp(y * pitch), np.uintp((y + 2 * half + 1) * pitch)
-        c, d = np.uintp((y - 1) * pitch), np.uintp((y + 2 * half + 2) * pitch)
-        for i in range(pitch):
+        y = pad + (top + k) * step - margin - half
+        a, b = np.uintp(y * pitch + begin), np.uintp((y + 2 * half + 1) * pitch + begin)
+        c, d = np.uintp((y - 1) * pitch + begin), np.uintp((y + 2 * half + 2) * pitch + begin)
+        for i in range(n + 2 * half + 3):
             x = np.uintp(i)
             inner[x] = np.int32(sums[b + x] - sums[a + x])
             wide[x] = np.int32(sums[d + x] - sums[c + x])
-        for i in range((columns - 1) * step + 1):
+        for i in range(n):
             x = np.uintp(i)
             box = np.float32(np.int32(inner[i1 + x] - inner[i0 + x])) * w00
-            rim = np.int32(np.int32(inner[r1 + x] - inner[r0 + x]) + np.int32(wide[i1 + x] - wide[i0 + x]))
-            corner = np.float32(np.int32(wide[r1 + x] - wide[r0 + x])) * w11
+            rim = np.int32(np.int32(inner[r1 + x] - inner[x]) + np.int32(wide[i1 + x] - wide[i0 + x]))
+            corner = np.float32(np.int32(wide[r1 + x] - wide[x])) * w11
             line[x] = box + np.float32(rim) * w01 + corner
         target = np.uintp(k * columns)
         if step == 1:
@@ -205,16 +205,16 @@ def smooth(sums: Any, pitch: int, pad: int, step: int, half: int, edge: float, m
 
 
 @kernel
-def _sample(grey: Any, first: int, rows: int, columns: int, x: Any, y: Any, dx: Any, dy: Any, lattice: Any,
-            at: Any, fx: Any, fy: Any, means: Any) -> None:  # fmt: skip
+def _sample(grey: Any, top: int, rows: int, left: int, columns: int, across: int, x: Any, y: Any,
+            dx: Any, dy: Any, lattice: Any, at: Any, fx: Any, fy: Any, means: Any) -> None:  # fmt: skip
     """means[i * 21 + j]: the smooth image, bilinear, at cell (i, j) of the turned grid centred at (x, y).
 
-    One cell to the right is (dx, dy), one down is (-dy, dx), in its samples. `grey` holds its rows from `first` on; it
-    has `rows` in all, and positions beyond its border are moved to the border. `lattice` [2, 441] has the offsets j
-    and i of the cells. Places first, reads after: so the first loop is vectorised.
+    One cell to the right is (dx, dy), one down is (-dy, dx), in its samples. `grey` holds `across` of its
+    `columns` from `left` on, of its `rows` those from `top` on; positions beyond its border are moved there.
+    `lattice` [2, 441] has the offsets j and i of the cells. Places first, reads after: so the first loop is vectorised.
     """
     right, bottom, zero = np.float32(columns - 1.01), np.float32(rows - 1.01), np.float32(0)
-    pitch, begin = np.int32(columns), np.int32(first)
+    pitch, first_row, first_column = np.int32(across), np.int32(top), np.int32(left)
     for k in range(CELLS * CELLS):
         u, v = lattice[0, k], lattice[1, k]
         p = x + (u * dx - v * dy)
@@ -225,8 +225,8 @@ def _sample(grey: Any, first: int, rows: int, columns: int, x: Any, y: Any, dx: 
         q = bottom if q > bottom else q
         ip, iq = np.int32(p), np.int32(q)
         fx[k], fy[k] = p - np.float32(ip), q - np.float32(iq)
-        at[k] = np.int32(np.int32(np.int32(iq - begin) * pitch) + ip)
-    one, low = np.uintp(1), np.uintp(columns)
+        at[k] = np.int32(np.int32(np.int32(iq - first_row) * pitch) + np.int32(ip - first_column))
+    one, low = np.uintp(1), np.uintp(across)
     for k in range(CELLS * CELLS):
         o = np.uintp(at[k])
         a, b = grey[o], grey[o + low]
@@ -292,11 +292,12 @@ def _normalise(out: Any) -> None:
 
 
 @kernel
-def describe(grey: Any, step: int, margin: int, first: int, rows: int, columns: int, candidates: Any, angles: Any,
-             chosen: Any, extended: bool, weights: Any, descriptors: Any) -> None:  # fmt: skip
-    """Descriptors of the candidates `chosen`, from the rows from `first` on of an image that `smooth` made.
+def describe(grey: Any, step: int, margin: int, top: int, rows: int, left: int, columns: int, across: int,
+             candidates: Any, angles: Any, chosen: Any, extended: bool, weights: Any,
+             descriptors: Any) -> None:  # fmt: skip
+    """Descriptors of the candidates `chosen`, from the part of a smooth image that `smooth` made.
 
-    `rows` is how many rows the image would have in all.
+    The part begins at row `top` and column `left` and is `across` wide, the whole would be [rows, columns].
     """
     means = np.empty(CELLS * CELLS, np.float32)
     at = np.empty(CELLS * CELLS, np.int32)
@@ -313,7 +314,7 @@ def describe(grey: Any, step: int, margin: int, first: int, rows: int, columns: 
         x = np.float32((candidates[k, 0] + margin) / step)
         y = np.float32((candidates[k, 1] + margin) / step)
         dx, dy = np.float32(math.cos(angle) * side), np.float32(math.sin(angle) * side)
-        _sample(grey, first, rows, columns, x, y, dx, dy, lattice, at, fx, fy, means)
+        _sample(grey, top, rows, left, columns, across, x, y, dx, dy, lattice, at, fx, fy, means)
         if extended:
             _collect_extended(means, weights, descriptors[k])
         else:

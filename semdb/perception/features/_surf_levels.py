@@ -42,6 +42,13 @@ class Level:
         """Samples along a side of the image of so many pixels."""
         return -(-(pixels - 1 + 2 * self.margin) // self.step) + 1
 
+    def window(self, positions: Float32Array, reach: float, samples: int) -> tuple[int, int]:
+        """First and last (not included) of the `samples` along a side that lie within `reach` of the `positions`."""
+        first = int((float(positions.min()) + self.margin - reach) // self.step)
+        last = int((float(positions.max()) + self.margin + reach) // self.step) + 2
+        first = min(max(first, 0), samples - 2)
+        return first, max(min(last, samples), first + 2)
+
 
 def level_keys(sizes: Float32Array) -> npt.NDArray[np.int64]:
     """Key of the level that serves keypoints of `sizes` [n]; depends on nothing but the size."""

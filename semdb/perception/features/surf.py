@@ -29,6 +29,7 @@ from semdb.types import BoolArray, Features, Float32Array, ImageArray, IntArray
 
 UPRIGHT_ANGLE = 270.0  # what OpenCV gives upright keypoints
 MASK_TILE = 16  # sample rows that share their columns to look at, when there is a mask
+MASK_REACH = 3  # samples around the mask that are looked at
 MIN_CHUNK = 64  # keypoints that are worth a task of their own
 _NO_SUMS = np.zeros((1, 1), np.int32)
 
@@ -237,25 +238,16 @@ class SURF:
             level = level_of(key)
             rows, columns = level.samples(plane.height), level.samples(plane.width)
             reach = 15 * CELL * candidates[chosen, 2].max() + 2 * level.step  # of a window turned by 45 degrees
-            y = candidates[chosen, 1] + level.margin
-            first = min(max(int((y.min() - reach) / level.step), 0), rows - 2)
-            last = max(min(int((y.max() + reach) / level.step) + 2, rows), first + 2)
-            grey = self._scratch.array("grey", ((last - first) * columns,), np.float32)
+            left, right = level.window(candidates[chosen, 0], reach, columns)
+            top, bottom = level.window(candidates[chosen, 1], reach, rows)
+            across = right - left
+            grey = self._scratch.array("grey", ((bottom - top) * across,), np.float32)
             smooth(
-                flat,
-                pitch,
-                plane.pad,
-                level.step,
-                level.half,
-                level.edge,
-                level.margin,
-                first,
-                last - first,
-                columns,
-                grey,
-            )
+                flat, pitch, plane.pad, level.step, level.half, level.edge, level.margin,
+                top, bottom - top, left, across, grey,
+            )  # fmt: skip
             describe(
-                grey, level.step, level.margin, first, rows, columns, candidates, angles,
+                grey, level.step, level.margin, top, rows, left, columns, across, candidates, angles,
                 chosen, self.extended, weights, descriptors,
             )  # fmt: skip
 
@@ -320,18 +312,22 @@ def _checked_mask(mask: npt.NDArray[Any], shape: tuple[int, ...]) -> BoolArray:
 def _mask_bands(region: BoolArray, step: int, rows: int, columns: int) -> list[tuple[int, int, npt.NDArray[np.int64]]]:
     """(first row, last row, column spans [k, 2]) in samples of `step` pixels, enough for every keypoint in the region.
 
-    A keypoint lies up to one and a half samples from the sample that found it.
+    A sample lies in its block of pixels or in the next, and a keypoint within one sample and a half of its sample.
     """
-    reach = 2 * step + 1
-    wide = cv2.dilate(region.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
-    bands = []
-    for first in range(0, rows, MASK_TILE):
-        last = min(first + MASK_TILE, rows)
-        used = wide[first * step : last * step].any(axis=0)[: columns * step].reshape(columns, step).any(axis=1)
-        edges = np.flatnonzero(np.diff(np.concatenate(([0], used.view(np.int8), [0]))))
-        if len(edges):
-            bands.append((first, last, _merged(edges.reshape(-1, 2))))
-    return bands
+    grid = region[: rows * step, : columns * step].astype(np.uint8) * np.uint8(255)
+    while grid.shape[0] > rows:  # a mean over 2x2 pixels is above 0 where one of them is
+        halved = cv2.resize(grid, (grid.shape[1] // 2, grid.shape[0] // 2), interpolation=cv2.INTER_AREA)
+        grid = (halved > 0).astype(np.uint8) * np.uint8(255)
+    wide = cv2.dilate(grid, np.ones((2 * MASK_REACH + 1, 2 * MASK_REACH + 1), np.uint8))
+    starts = range(0, rows, MASK_TILE)
+    wide = cv2.copyMakeBorder(wide, 0, len(starts) * MASK_TILE - rows, 0, 0, cv2.BORDER_CONSTANT, value=0)
+    used = np.zeros((len(starts), columns + 2), np.int8)
+    used[:, 1:-1] = wide.reshape(len(starts), MASK_TILE, columns).max(axis=1) > 0
+    band, edge = np.nonzero(np.diff(used, axis=1))
+    return [
+        (starts[k], min(starts[k] + MASK_TILE, rows), _merged(edge[band == k].reshape(-1, 2)))
+        for k in np.unique(band).tolist()
+    ]
 
 
 def _merged(spans: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
