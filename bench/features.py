@@ -2,8 +2,9 @@
 
     python -m bench.features RECORDING... [--pairs N] [--json FILE] [--plot FILE]
 
-One thread, all features in the same run. Pairs of frames at several gaps; the first frame of a pair has depth and
-stands for a keyframe, the second is the query. Figures depend on the machine; the ratios at the end hardly do.
+One thread, all features in the same run; time is processor time, so that other work on the machine matters little.
+Pairs of frames at several gaps; the first frame of a pair has depth and stands for a keyframe, the second is the query.
+Figures depend on the machine; the ratios at the end hardly do.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ import poselib
 from semdb.geometry import back_project, invert_pose, pixels_to_normalized, pose_error, project, transform_points
 from semdb.perception.features.sift import SiftFeatures
 from semdb.perception.features.surf import SURF
+from semdb.perception.features.surf_features import SurfFeatures
 from semdb.recordings import Recording, open_recordings
 from semdb.types import Camera
 
@@ -85,9 +87,10 @@ def features() -> dict[str, Extract]:
         return extract
 
     contestants = {
-        OURS: from_semdb(SURF(100)),
-        "surf 400": from_semdb(SURF(400)),
-        "surf 100, best 1000": from_semdb(SURF(100, max_keypoints=1000)),
+        OURS: from_semdb(SurfFeatures(100, max_keypoints=0)),
+        "surf 400": from_semdb(SurfFeatures(400, max_keypoints=0)),
+        "surf 100, best 1000": from_semdb(SurfFeatures(100, max_keypoints=1000)),
+        "surf 100 as OpenCV": from_semdb(SURF(100)),
         REFERENCE: from_semdb(SiftFeatures(1000)),
         "orb 1000": from_opencv(cv2.ORB.create(1000)),
         "akaze": from_opencv(_akaze()),
@@ -130,9 +133,9 @@ def describe(
         for name, extract in contestants.items():
             if number == 0:
                 extract(grey)  # compiles, warms caches
-            start = time.perf_counter()
+            start = time.process_time()
             xy, descriptors = extract(grey)
-            tallies[name].milliseconds.append((time.perf_counter() - start) * 1e3)
+            tallies[name].milliseconds.append((time.process_time() - start) * 1e3)
             tallies[name].keypoints.append(len(xy))
             z = look_up(frame.depth, xy)
             points = transform_points(shot.pose, back_project(recording.camera, xy, z))
@@ -156,7 +159,8 @@ def compare(first: Shot, second: Shot, name: str, camera: Camera) -> dict[str, f
     """Repeatability, matches, precision, and the error of the pose of `second` from the points of `first`."""
     a, b = first.views[name], second.views[name]
     if len(a.xy) < 2 or len(b.xy) < 2:
-        return {"repeatability": 0.0, "matches": 0, "precision": float("nan"), "metres": np.inf, "degrees": np.inf}
+        nothing = dict.fromkeys(("precision", "consistent"), float("nan"))
+        return {"repeatability": 0.0, "matches": 0, **nothing, "metres": np.inf, "degrees": np.inf}
     in_second = transform_points(invert_pose(second.pose), a.points)
     there = project(camera, in_second)
     z = look_up(second.depth, there)
@@ -169,22 +173,23 @@ def compare(first: Shot, second: Shot, name: str, camera: Camera) -> dict[str, f
     pairs = np.array([(m.queryIdx, m.trainIdx) for m, n in two if m.distance < RATIO * n.distance]).reshape(-1, 2)
     pairs = pairs[np.isfinite(a.points[pairs[:, 1], 0])]
     right = np.hypot(*(b.xy[pairs[:, 0]] - there[pairs[:, 1]]).T) < RIGHT_PX
-    metres, degrees = pose_of(b.xy[pairs[:, 0]], a.points[pairs[:, 1]], camera, second.pose)
+    metres, degrees, consistent = pose_of(b.xy[pairs[:, 0]], a.points[pairs[:, 1]], camera, second.pose)
     return {
         "repeatability": float((distances[visible] < REPEAT_PX).mean()) if visible.any() else float("nan"),
         "matches": len(pairs),
         "precision": float(right.mean()) if len(pairs) else float("nan"),
+        "consistent": consistent,
         "metres": metres,
         "degrees": degrees,
     }
 
 
-def pose_of(xy: np.ndarray, points: np.ndarray, camera: Camera, truth: np.ndarray) -> tuple[float, float]:
-    """Error (metres, degrees) of the pose by LO-RANSAC PnP; infinite with fewer than 12 inliers."""
+def pose_of(xy: np.ndarray, points: np.ndarray, camera: Camera, truth: np.ndarray) -> tuple[float, float, float]:
+    """Error (metres, degrees) of the pose by LO-RANSAC PnP, infinite with fewer than 12 inliers; share of inliers."""
     undistorted = pixels_to_normalized(camera, xy) * [camera.fx, camera.fy] + [camera.cx, camera.cy]
     fine = np.isfinite(undistorted).all(axis=1)
     if fine.sum() < 12:
-        return np.inf, np.inf
+        return np.inf, np.inf, float("nan")
     model = {
         "model": "PINHOLE",
         "width": camera.width,
@@ -194,10 +199,10 @@ def pose_of(xy: np.ndarray, points: np.ndarray, camera: Camera, truth: np.ndarra
     ransac = {"max_reproj_error": 6.0, "min_iterations": 200, "max_iterations": 5000, "seed": 0}
     pose, info = poselib.estimate_absolute_pose(undistorted[fine], points[fine], model, ransac)
     if info["num_inliers"] < 12:
-        return np.inf, np.inf
+        return np.inf, np.inf, info["num_inliers"] / len(xy)
     camera_from_world = np.eye(4)
     camera_from_world[:3] = pose.Rt
-    return pose_error(invert_pose(camera_from_world), truth)
+    return *pose_error(invert_pose(camera_from_world), truth), info["num_inliers"] / len(xy)
 
 
 def summarise(tally: Tally) -> dict[str, Any]:
@@ -213,6 +218,7 @@ def summarise(tally: Tally) -> dict[str, Any]:
             "repeatability": float(np.nanmean([r["repeatability"] for r in results])),
             "matches": float(np.mean([r["matches"] for r in results])),
             "precision": float(np.nanmean([r["precision"] for r in results])),
+            "consistent": float(np.nanmean([r["consistent"] for r in results])),
             "success": float(good.mean()),
             "median_metres": float(np.median(metres[good])) if good.any() else None,
             "median_degrees": float(np.median(degrees[good])) if good.any() else None,
@@ -243,7 +249,15 @@ def show(results: dict[str, Any], compared: dict[str, Any]) -> None:
     print(f"{'':22s} {'ms/frame':>9s} {'keypoints':>9s} {'us/kp':>6s}")
     for name, result in results.items():
         print(f"{name:22s} {result['ms_per_frame']:9.1f} {result['keypoints']:9.0f} {result['us_per_keypoint']:6.1f}")
-    for quantity in ("repeatability", "matches", "precision", "success", "median_metres", "median_degrees"):
+    for quantity in (
+        "repeatability",
+        "matches",
+        "precision",
+        "consistent",
+        "success",
+        "median_metres",
+        "median_degrees",
+    ):
         print(f"\n{quantity + ' at gap':22s} " + " ".join(f"{gap:>8s}" for gap in results[OURS]["gaps"]))
         for name, result in results.items():
             cells = (

@@ -38,9 +38,9 @@ def orientation_weights() -> Any:
     return np.where(disc, gaussian(ACROSS, 2.5), np.float32(0)).ravel()
 
 
-def descriptor_weights() -> Any:
-    """float32 [400]: weights of the gradients of a descriptor."""
-    return gaussian(GRID, 3.3).ravel()
+def descriptor_weights(sigma: float) -> Any:
+    """float32 [400]: weights of the gradients of a descriptor, `sigma` in cells."""
+    return gaussian(GRID, sigma).ravel()
 
 
 @kernel

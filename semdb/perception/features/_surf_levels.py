@@ -58,14 +58,14 @@ def level_keys(sizes: Float32Array) -> npt.NDArray[np.int64]:
 
 
 @lru_cache(maxsize=256)
-def level_of(key: int) -> Level:
-    """The level of a key: its box has the variance of a cell, less what the bilinear reads of samples `step` apart
-    add (a sixth of the squared step on average), plus what OpenCV's reads of single pixels add.
+def level_of(key: int, smoothing: float) -> Level:
+    """The level of a key: its box has `smoothing` times the variance of a cell, less what bilinear reads of samples
+    `step` apart add (a sixth of the squared step on average), plus what OpenCV's reads of single pixels add.
     """
     band, rank = divmod(key, 64)
     step = 1 << band
     side = rank * SPACING * step
-    variance = max(side * side / 12 + (1 - step * step) / 6, 0.02)
+    variance = max(smoothing * side * side / 12 + (1 - step * step) / 6, 0.02)
     half = int((math.sqrt(1 + 12 * variance) - 1) / 2)
     inner = half * (half + 1) * (2 * half + 1) / 3  # sum of squared offsets
     edge = (variance * (2 * half + 1) - inner) / (2 * ((half + 1) ** 2 - variance))

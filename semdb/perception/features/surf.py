@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semdb.errors import UsageError
-from semdb.perception.features._surf_levels import CELL, level_keys, level_of
+from semdb.perception.features._surf_levels import CELL, Level, level_keys, level_of
 from semdb.types import BoolArray, Features, Float32Array, ImageArray, IntArray
 
 UPRIGHT_ANGLE = 270.0  # what OpenCV gives upright keypoints
@@ -39,8 +39,12 @@ class SURF:
 
     `hessian_threshold`: least determinant of the Hessian of a keypoint. `n_octaves`, `n_octave_layers`: how many
     doublings of the scale, how many scales in each. `extended`: 128 instead of 64 numbers per descriptor. `upright`:
-    do not measure the orientation (all angles are 270, as OpenCV has them). `max_keypoints`: keep the
-    strongest by response, 0 for all. `threads`: how many threads one call uses; they do not change a bit of the result.
+    do not measure the orientation (all angles are 270, as OpenCV has them).
+
+    Not OpenCV's: `window_sigma`: width of the Gaussian that weighs the descriptor window, in cells, of which there are
+    20 across it. `smoothing`: variance of the grey means that gradients are taken from, relative to that of a
+    square cell. `max_keypoints`: keep the strongest by response, 0 for all. `threads`: how many threads one call uses;
+    they do not change a bit of the result.
 
     Raises UsageError for parameters out of range.
     """
@@ -53,6 +57,8 @@ class SURF:
         extended: bool = False,
         upright: bool = False,
         *,
+        window_sigma: float = 3.3,
+        smoothing: float = 1.0,
         max_keypoints: int = 0,
         threads: int = 1,
     ) -> None:
@@ -62,6 +68,10 @@ class SURF:
             raise UsageError(
                 f"SURF: n_octaves is {n_octaves} and n_octave_layers {n_octave_layers}, they must be 1 to 8 and 1 to 16"
             )
+        if not 1 <= window_sigma <= 100 or not 0.25 <= smoothing <= 8:
+            raise UsageError(
+                f"SURF: window_sigma is {window_sigma} and smoothing {smoothing}, they must be 1 to 100 and 0.25 to 8"
+            )
         if max_keypoints < 0 or threads < 1:
             raise UsageError(f"SURF: max_keypoints is {max_keypoints} (0 or more), threads is {threads} (1 or more)")
         self.hessian_threshold = float(hessian_threshold)
@@ -69,6 +79,8 @@ class SURF:
         self.n_octave_layers = int(n_octave_layers)
         self.extended = bool(extended)
         self.upright = bool(upright)
+        self.window_sigma = float(window_sigma)
+        self.smoothing = float(smoothing)
         self.max_keypoints = int(max_keypoints)
         self.threads = int(threads)
         self._pool: ThreadPoolExecutor | None = None
@@ -121,11 +133,14 @@ class SURF:
     def empty(self) -> bool:
         return False
 
+    def _level(self, key: int) -> Level:
+        return level_of(key, self.smoothing)
+
     def _integral(self, image: ImageArray, largest: int) -> _Plane:
         from semdb.perception.features._surf_detect import integral
 
         step = 1 << (self.n_octaves - 1)
-        pad = -(-level_of(int(level_keys(np.array([largest], np.float32))[0])).pad // step) * step
+        pad = -(-self._level(int(level_keys(np.array([largest], np.float32))[0])).pad // step) * step
         height, width = image.shape
         padded = self._scratch.array("padded", (height + 2 * pad, width + 2 * pad), np.uint8)
         cv2.copyMakeBorder(image, pad, pad, pad, pad, cv2.BORDER_REPLICATE, dst=padded)
@@ -232,10 +247,10 @@ class SURF:
         from semdb.perception.features._surf_describe import describe, descriptor_weights, smooth
 
         flat, pitch = plane.sums.reshape(-1), plane.sums.shape[1]
-        weights = descriptor_weights()
+        weights = descriptor_weights(self.window_sigma)
 
         def run(key: int, chosen: npt.NDArray[np.intp]) -> None:
-            level = level_of(key)
+            level = self._level(key)
             rows, columns = level.samples(plane.height), level.samples(plane.width)
             reach = 15 * CELL * candidates[chosen, 2].max() + 2 * level.step  # of a window turned by 45 degrees
             left, right = level.window(candidates[chosen, 0], reach, columns)
