@@ -75,7 +75,13 @@ class TestServer:
 def connect(url: URL) -> pymysql.Connection:
     """A plain connection to the server of `url`, without a schema."""
     return pymysql.connect(
-        host=url.host, port=url.port or 3306, user=url.username, password=str(url.password or ""), connect_timeout=5
+        host=url.host,
+        port=url.port or 3306,
+        user=url.username,
+        password=str(url.password or ""),
+        connect_timeout=5,
+        # A test that leaves a transaction open would otherwise hold up the drop of its schema for a day.
+        init_command="SET SESSION lock_wait_timeout = 10",
     )
 
 
@@ -114,14 +120,23 @@ def _started(folder: Path, mariadbd: str, install: str) -> Iterator[TestServer]:
         f"CREATE USER {account} IDENTIFIED BY '{password}';\nGRANT ALL ON *.* TO {account} WITH GRANT OPTION;\n"
     )
     (folder / "data").mkdir()
+    # Servers delete temporary tables that they find at their start: in a shared folder, those of others too.
+    (folder / "tmp").mkdir()
     user = _server_user()
     if user is not None:
-        for path in (folder, folder / "init.sql", folder / "data"):
+        for path in (folder, folder / "init.sql", folder / "data", folder / "tmp"):
             shutil.chown(path, user, user)
     folder.chmod(0o755)
     as_user = [f"--user={user}"] if user else []
     made = subprocess.run(
-        [install, "--no-defaults", f"--datadir={folder / 'data'}", "--skip-test-db", *as_user],
+        [
+            install,
+            "--no-defaults",
+            f"--datadir={folder / 'data'}",
+            f"--tmpdir={folder / 'tmp'}",
+            "--skip-test-db",
+            *as_user,
+        ],
         capture_output=True,
         text=True,
         timeout=START_TIMEOUT_S,
@@ -134,6 +149,7 @@ def _started(folder: Path, mariadbd: str, install: str) -> Iterator[TestServer]:
             mariadbd,
             *SETTINGS,
             f"--datadir={folder / 'data'}",
+            f"--tmpdir={folder / 'tmp'}",
             f"--socket={folder / 'socket'}",
             f"--pid-file={folder / 'pid'}",
             f"--log-error={folder / 'error.log'}",

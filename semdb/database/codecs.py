@@ -1,7 +1,7 @@
 """Arrays and masks as blobs: little-endian, with dtype, shape, version and checksum, refused when anything is off.
 
 Layout of an array: magic ``SDBA``, version (1 byte), dtype code (1), number of dimensions (1), zero (1), CRC-32 of
-all that follows (4), shape (4 each), data in C order. A mask (magic ``SDBM``) is the same with a one-dimensional
+all other bytes (4), shape (4 each), data in C order. A mask (magic ``SDBM``) is the same with a one-dimensional
 uint32 array: height, width, then the lengths of the runs of the row-major mask, the first run being background.
 """
 
@@ -23,6 +23,7 @@ VERSION = 1
 KEYPOINT_COLUMNS = ("x", "y", "size", "angle", "response", "laplacian", "X", "Y", "Z")
 
 _HEADER = struct.Struct("<4sBBBBI")
+_CHECKED = 8  # bytes of the header before the checksum
 _DTYPES: dict[int, np.dtype[Any]] = {
     1: np.dtype("<f4"),
     2: np.dtype("u1"),
@@ -40,7 +41,8 @@ def encode_array(array: npt.NDArray[Any], *, magic: bytes = ARRAY_MAGIC) -> byte
     if code is None or array.ndim > 8:
         raise CodecError(f"an array of {array.dtype} with {array.ndim} dimensions cannot be stored")
     body = struct.pack(f"<{array.ndim}I", *array.shape) + np.ascontiguousarray(array, dtype=dtype).tobytes()
-    return _HEADER.pack(magic, VERSION, code, array.ndim, 0, zlib.crc32(body)) + body
+    start = _HEADER.pack(magic, VERSION, code, array.ndim, 0, 0)[:_CHECKED]
+    return start + struct.pack("<I", zlib.crc32(body, zlib.crc32(start))) + body
 
 
 def decode_array(blob: bytes, where: str, *, magic: bytes = ARRAY_MAGIC) -> npt.NDArray[Any]:
@@ -61,7 +63,8 @@ def decode_array(blob: bytes, where: str, *, magic: bytes = ARRAY_MAGIC) -> npt.
     if len(blob) != expected:
         kind = "truncated" if len(blob) < expected else "too long"
         raise CodecError(f"{where}: the blob is {kind} ({len(blob)} bytes, shape {shape} needs {expected})")
-    if zlib.crc32(memoryview(blob)[_HEADER.size :]) != checksum:
+    view = memoryview(blob)
+    if zlib.crc32(view[_HEADER.size :], zlib.crc32(view[:_CHECKED])) != checksum:
         raise CodecError(f"{where}: the blob's checksum is wrong; delete the recording and ingest it again")
     return np.frombuffer(blob, dtype=dtype, offset=start).reshape(shape)
 

@@ -48,15 +48,15 @@ def test_masks_come_back(mask: npt.NDArray[np.bool_]) -> None:
 
 
 def test_the_layout_of_a_blob() -> None:
-    body = struct.pack("<I2f", 2, 1.0, -2.5)
-    assert (
-        encode_array(np.array([1.0, -2.5], ">f4"))
-        == b"SDBA\x01\x01\x01\x00" + struct.pack("<I", zlib.crc32(body)) + body
-    )
+    def checked(start: bytes, body: bytes) -> bytes:
+        return start + struct.pack("<I", zlib.crc32(start + body)) + body
+
+    expected = checked(b"SDBA\x01\x01\x01\x00", struct.pack("<I2f", 2, 1.0, -2.5))
+    assert encode_array(np.array([1.0, -2.5], ">f4")) == expected
     mask = np.zeros((2, 4), np.bool_)
     mask[0, 2:] = mask[1, :1] = True
     runs = struct.pack("<I5I", 5, 2, 4, 2, 3, 3)  # how many numbers, height, width, runs
-    assert encode_mask(mask) == b"SDBM\x01\x05\x01\x00" + struct.pack("<I", zlib.crc32(runs)) + runs
+    assert encode_mask(mask) == checked(b"SDBM\x01\x05\x01\x00", runs)
 
 
 def test_a_mask_is_small() -> None:
@@ -77,8 +77,6 @@ def test_arrays_of_other_kinds_are_refused() -> None:
 def test_no_changed_byte_goes_unnoticed(position: int, difference: int) -> None:
     blob = bytearray(encode_array(np.arange(40, dtype="<f4").reshape(8, 5)))
     position %= len(blob)
-    if position == 7:  # the reserved byte
-        return
     blob[position] ^= difference
     with pytest.raises(CodecError, match="row 7"):
         decode_array(bytes(blob), "row 7")
