@@ -241,6 +241,19 @@ def test_region_gives_what_the_whole_image_has_there(noise: ImageArray, seed: in
         assert_equal(SURF(threads=threads).extract(noise, mask), taken(whole, inside))
 
 
+def test_window_and_smoothing_change_only_the_descriptor(noise: ImageArray) -> None:
+    wide, usual = SURF(window_sigma=6.5, smoothing=2.0, threads=2), SURF()
+    first, second = wide.extract(noise), usual.extract(noise)
+    for name in ("xy", "size", "angle", "response", "laplacian"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name), err_msg=name)
+    cosine = np.einsum("ij,ij->i", first.descriptors, second.descriptors)
+    assert 0.8 < np.median(cosine) < 0.99
+    mask = np.zeros(noise.shape, bool)
+    mask[60:160, 100:220] = True
+    column, row = np.floor(first.xy + 0.5).astype(int).T
+    assert_equal(wide.extract(noise, mask), taken(first, np.flatnonzero(mask[row, column])))
+
+
 def test_full_and_empty_region(noise: ImageArray) -> None:
     assert_equal(SURF().extract(noise, np.full(noise.shape, 255, np.uint8)), SURF().extract(noise))
     assert len(SURF().extract(noise, np.zeros(noise.shape, np.uint8))) == 0
@@ -301,6 +314,8 @@ def test_what_is_no_grey_image_is_refused(image: ImageArray, mask: np.ndarray | 
         {"n_octave_layers": 0},
         {"max_keypoints": -1},
         {"threads": 0},
+        {"window_sigma": 0.5},
+        {"smoothing": 0.0},
     ],
 )
 def test_parameters_out_of_range_are_refused(parameters: dict[str, float]) -> None:

@@ -8,7 +8,6 @@ from semdb.perception.features.opencv import check_image, feature_info
 from semdb.perception.features.surf import SURF
 from semdb.types import BoolArray, Features, ImageArray, ModelInfo
 
-
 # OpenCV weighs the window of a descriptor with 3.3 cells, which leaves little of its rim, and takes gradients from
 # means of one cell. These gave a quarter more inliers between frames far apart (`docs/surf.md`).
 WINDOW_SIGMA = 6.5
