@@ -33,5 +33,5 @@ def command(
     from semdb.database.readonly import run_readonly
 
     columns, rows = run_readonly(overrides.settings(), statement)
-    with closing(rows):  # type: ignore[type-var]  # a generator
+    with closing(rows):
         print_rows(columns, rows, fmt)
