@@ -50,6 +50,10 @@ def double(x: int) -> int:
     return 2 * x
 
 
+def triple(x: int) -> int:
+    return 3 * x
+
+
 def test_kernel_without_a_cache_folder_works_and_says_so(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -57,14 +61,14 @@ def test_kernel_without_a_cache_folder_works_and_says_so(
 
     def no_folder(function: Callable[..., Any], **options: Any) -> Any:
         if options.get("cache"):
-            raise RuntimeError("cannot cache function 'double': no locator available for file 'double.py'")
+            raise RuntimeError(f"cannot cache function {function.__name__!r}: no locator available")
         return njit(function, **options)
 
     monkeypatch.setattr(_jit.numba, "njit", no_folder)
     _jit._warn_uncached.cache_clear()
     with caplog.at_level(logging.WARNING):
-        compiled = [_jit.kernel(double), _jit.kernel(double)]
-    assert [f(21) for f in compiled] == [42, 42]
+        compiled = [_jit.kernel(double), _jit.kernel(triple)]
+    assert [f(21) for f in compiled] == [42, 63]
     assert len(caplog.records) == 1
     assert "NUMBA_CACHE_DIR" in caplog.text
 

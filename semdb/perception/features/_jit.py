@@ -27,7 +27,9 @@ def kernel(function: _Function) -> _Function:
     try:
         return numba.njit(function, cache=True, **_OPTIONS)  # type: ignore[no-any-return]
     except RuntimeError as error:  # numba found no folder that it may write
-        _warn_uncached(str(error))
+        if "cannot cache" not in str(error):
+            raise
+        _warn_uncached()
         return numba.njit(function, **_OPTIONS)  # type: ignore[no-any-return]
 
 
@@ -45,9 +47,8 @@ def _check_named_folder(folder: str) -> None:
 
 
 @lru_cache(maxsize=1)
-def _warn_uncached(reason: str) -> None:
+def _warn_uncached() -> None:
     logger.warning(
-        "compiled kernels cannot be cached (%s); every process compiles them anew, about 10 s. "
-        "Set NUMBA_CACHE_DIR to a folder that can be written",
-        reason,
+        "compiled kernels cannot be kept: neither the folder of the package nor the user's cache can be written. "
+        "Every process compiles them anew, about 10 s; set NUMBA_CACHE_DIR to a folder that can be written"
     )
