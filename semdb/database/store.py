@@ -24,7 +24,7 @@ from semdb.database.records import (
     StoredKeyframe,
     WriteResult,
 )
-from semdb.database.tables import recordings
+from semdb.database.tables import maps, recordings
 from semdb.database.writing import KeyframeWriter
 from semdb.errors import NotFoundError, SchemaError
 from semdb.types import BoolArray, Camera, Float32Array, FloatArray, Localization, ModelInfo
@@ -101,7 +101,9 @@ class Store:
 
     def check_models(self, map_id: int, models: Iterable[ModelInfo]) -> None:
         """Raises ProvenanceError, naming both, when the map is described by other models than `models`."""
-        planning.check_models(self.map_models(map_id), models, f"the map {map_id}")
+        stored = self.map_models(map_id)
+        name = retry.read(self.engine, lambda c: c.execute(select(maps.c.name).where(maps.c.id == map_id)).scalar())
+        planning.check_models(stored, models, f"the map {name!r}")
 
     def find_recording(self, map_id: int, name: str) -> int:
         """The id of a recording. Raises NotFoundError."""

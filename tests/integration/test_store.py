@@ -154,7 +154,8 @@ def test_other_models_are_refused_with_both_names(store: Store) -> None:
         lambda: store.write_keyframe(recording_id, record(1, description(1, models=OTHER_MODELS))),
         lambda: store.check_models(map_id, OTHER_MODELS),
     ):
-        with pytest.raises(ProvenanceError, match=r"encoder gist.*not by onnx:resnet50.onnx \(sha256 abababababab\)"):
+        both = r"the map 'room' is described by the encoder gist.*not by onnx:resnet50.onnx \(sha256 abababababab\)"
+        with pytest.raises(ProvenanceError, match=both):
             attempt()
     other_settings = (dataclasses.replace(MODELS[0], config='{"score_threshold": 0.7}'), *MODELS[1:])
     with pytest.raises(ProvenanceError, match=r"0\.5.*0\.7"):
