@@ -18,6 +18,7 @@ ORACLE = "oracle"
 # As the papers accept a pose: enough inliers, nothing else is asked.
 _COUNT_ONLY = VerdictOptions(
     localized_inliers=12,
+    many_first_inliers=12,
     ambiguous_inliers=12,
     convincing_inliers=12,
     minimum_spread=0.0,

@@ -48,14 +48,20 @@ class Pairs:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseEstimate:
-    """A pose with its support. `inliers` counts distinct keypoints of the query, `per_keyframe` the pairs."""
+    """A pose with its support. `inliers` counts distinct keypoints of the query, `per_keyframe` the pairs.
+
+    Guided matching finds pairs for wrong poses too, so what the first matching, which knew no pose, agreed on is kept
+    beside: `first_inliers` pairs of all keyframes, and their share `agreement` of the pairs with the keyframe that has
+    most of them.
+    """
 
     world_from_camera: FloatArray
     covariance: FloatArray | None
     pairs: Pairs  # inliers only
     inliers: int
     per_keyframe: tuple[int, ...]
-    tried_pairs: int
+    first_inliers: int
+    agreement: float
     residual_px: float  # median reprojection error of the inliers
     spread: float  # 0..1: share of a 4x4 grid over the image that holds inliers
 
@@ -161,12 +167,12 @@ def estimate_pose(
     `matches` are those of `match_view`, one per keyframe.
     """
     pairs = join_pairs(matches)
-    tried = len(pairs)
     points = world_points_of(pairs, keyframes)
     found = robust_pnp(query, pairs, points, options)
     if found is None:
         return None
     camera_from_world, agreeing = found
+    first = _first_support(pairs, agreeing)
     if options.guided:
         pairs = guided_pairs(query, keyframes, camera_from_world, options)
         points = world_points_of(pairs, keyframes)
@@ -181,7 +187,14 @@ def estimate_pose(
         except np.linalg.LinAlgError:
             return None
         camera_from_world, covariance = refined.camera_from_world, refined.covariance
-    return _estimate(query, keyframes, pairs, points, camera_from_world, covariance, tried, options)
+    return _estimate(query, keyframes, pairs, points, camera_from_world, covariance, first, options)
+
+
+def _first_support(pairs: Pairs, agreeing: BoolArray) -> tuple[int, float]:
+    """Pairs that agree before any is guided, and their share of the pairs with the keyframe that has most of them."""
+    counts = np.bincount(pairs.slot[agreeing])
+    best = int(counts.argmax())
+    return len(np.unique(pairs.query[agreeing])), float(counts[best] / np.count_nonzero(pairs.slot == best))
 
 
 def rival_pose(
@@ -216,7 +229,7 @@ def _estimate(
     points: FloatArray,
     camera_from_world: FloatArray,
     covariance: FloatArray | None,
-    tried: int,
+    first: tuple[int, float],
     options: PoseOptions,
 ) -> PoseEstimate | None:
     error = reprojection_px(query, camera_from_world, pairs.query, points)
@@ -230,7 +243,8 @@ def _estimate(
         pairs=inliers,
         inliers=len(np.unique(inliers.query)),
         per_keyframe=tuple(int((inliers.slot == slot).sum()) for slot in range(len(keyframes))),
-        tried_pairs=tried,
+        first_inliers=first[0],
+        agreement=first[1],
         residual_px=float(np.median(error[keep])),
         spread=image_spread(query, inliers.query),
     )

@@ -68,19 +68,22 @@ def workplace(rendered: Path, tmp_path: Path) -> Path:
     for name in NAMES:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copytree(rendered, tmp_path / name)
+    (tmp_path / ".venv").symlink_to(sys.prefix)
     shutil.copy(sorted((rendered / "rgb").iterdir())[7], tmp_path / "photo.png")
     masks = np.zeros((1, 1, 240, 320), np.float32)
     masks[:, :, 40:200, 60:260] = 1
-    write_constant_model(
-        tmp_path / "mask_rcnn.onnx",
-        {
-            "boxes": np.array([[60, 40, 259, 199]], np.float32),
-            "labels": np.array([62], np.int64),
-            "scores": np.array([0.9], np.float32),
-            "masks": masks,
-        },
-    )
-    write_mean_embedding_model(tmp_path / "places.onnx")
+    for name in ("mask_rcnn.onnx", "mask_rcnn_2go.onnx"):
+        write_constant_model(
+            tmp_path / name,
+            {
+                "boxes": np.array([[60, 40, 259, 199]], np.float32),
+                "labels": np.array([62], np.int64),
+                "scores": np.array([0.9], np.float32),
+                "masks": masks,
+            },
+        )
+    for name in ("places.onnx", "squeezenet_places365.onnx"):
+        write_mean_embedding_model(tmp_path / name)
     return tmp_path
 
 
@@ -102,7 +105,7 @@ def run(script: str, folder: Path, **variables: str) -> subprocess.CompletedProc
 def test_commands_of_the_documents_work(path: Path, workplace: Path, mariadb_url: str) -> None:
     for block in shell_blocks(path):
         script = SERVER_URL.sub(mariadb_url, block)
-        done = run(script, workplace, SEMDB_READER_URL=mariadb_url)
+        done = run(script, workplace, SEMDB_READER_URL=mariadb_url, MODELS=str(workplace))
         assert done.returncode == 0, f"{block}\n{done.stdout}\n{done.stderr}"
 
 

@@ -1,0 +1,60 @@
+"""What `auto` means, for an ingest and for a query."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from semdb.errors import UsageError
+from semdb.model_choice import settings_of_map, specs_for_ingest, specs_for_query
+from semdb.settings import Settings
+from semdb.types import ModelInfo
+
+MAP = (
+    ModelInfo("detector", "onnx:mask.onnx", "ab" * 32, '{"mask_threshold":0.5,"score_threshold":0.3}'),
+    ModelInfo("encoder", "gist", "", "{}"),
+    ModelInfo("features", "sift", "", '{"max_keypoints":700}'),
+)
+
+
+@pytest.fixture
+def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Settings:
+    for name in ("DETECTOR", "ENCODER", "FEATURES", "SCORE_THRESHOLD", "MAX_KEYPOINTS"):
+        monkeypatch.delenv(f"SEMDB_{name}", raising=False)
+    monkeypatch.chdir(tmp_path)
+    return Settings(cache_dir=tmp_path / "cache")
+
+
+def test_a_new_map_takes_what_needs_no_file_and_says_so(settings: Settings) -> None:
+    specs = specs_for_ingest(settings, (), has_masks=True)
+    assert (specs.detector, specs.encoder, specs.features) == ("recorded", "gist", "surf")
+    assert len(specs.notes) == 2
+    with pytest.raises(UsageError, match="SEMDB_DETECTOR=onnx:FILE"):
+        specs_for_ingest(settings, (), has_masks=False)
+
+
+def test_what_is_named_is_taken_without_a_word(settings: Settings) -> None:
+    named = settings.model_copy(update={"detector": "onnx:a.onnx", "encoder": "onnx:b.onnx", "features": "orb"})
+    specs = specs_for_ingest(named, MAP, has_masks=True)
+    assert (specs.detector, specs.encoder, specs.features, specs.notes) == ("onnx:a.onnx", "onnx:b.onnx", "orb", ())
+    assert specs_for_query(named, MAP) == specs
+
+
+def test_a_query_takes_the_maps_models_when_their_files_are_at_hand(settings: Settings, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"mask\.onnx.*abababababab.*SEMDB_DETECTOR"):
+        specs_for_query(settings, MAP)
+    file = settings.cache_dir / "models" / "mask.onnx"
+    file.parent.mkdir(parents=True)
+    file.write_bytes(b"weights")
+    specs = specs_for_query(settings, MAP)
+    assert (specs.detector, specs.encoder, specs.features) == (f"onnx:{file}", "gist", "sift")
+    with pytest.raises(UsageError, match="no keyframe"):
+        specs_for_query(settings, ())
+
+
+def test_the_maps_thresholds_hold_unless_others_are_set(settings: Settings) -> None:
+    taken = settings_of_map(settings, MAP)
+    assert (taken.score_threshold, taken.max_keypoints) == (0.3, 700)
+    own = Settings(score_threshold=0.7)
+    assert settings_of_map(own, MAP).score_threshold == 0.7
