@@ -10,7 +10,7 @@ from pathlib import Path
 from semdb.database.planning import check_models
 from semdb.database.records import MapInfo
 from semdb.database.store import Store
-from semdb.errors import NotFoundError, ProvenanceError, UsageError
+from semdb.errors import FrameError, NotFoundError, ProvenanceError, UsageError
 from semdb.localization.keyframe_cache import KeyframeCache
 from semdb.localization.localizer import Localizer, LocalizerOptions
 from semdb.localization.sources import MemorySource, SqlSource
@@ -67,11 +67,13 @@ def localize_images(
     options: LocalizeOptions | None = None,
     *,
     say: Callable[[str], None] | None = None,
+    unreadable: Callable[[FrameError], None] | None = None,
 ) -> Iterator[ImageLocalization]:
     """Localizes images one by one; every answer is logged in `queries`.
 
     `depth_paths` is empty or has one depth image per image. Raises NotFoundError for a map that is not there or
-    empty, ProvenanceError for models that did not make it, UsageError, FrameError for an image that cannot be read.
+    empty, ProvenanceError for models that did not make it, UsageError, FrameError for an image that cannot be read;
+    with `unreadable` that is called instead, and the other images go on.
     """
     options = options or LocalizeOptions()
     if depth_paths and len(depth_paths) != len(paths):
@@ -81,7 +83,13 @@ def localize_images(
     reader = QueryReader(camera=options.camera, like=_like(store, maps, options.like), known=cameras, say=say)
     for number, path in enumerate(paths):
         started = time.perf_counter()
-        query = reader.read(path, depth_paths[number] if depth_paths else None)
+        try:
+            query = reader.read(path, depth_paths[number] if depth_paths else None)
+        except FrameError as error:
+            if unreadable is None:
+                raise
+            unreadable(error)
+            continue
         decode_ms = (time.perf_counter() - started) * 1000
         description, localization = _ask(maps, query)
         timing = {"decode": decode_ms, **description.timing_ms, **localization.timing_ms}

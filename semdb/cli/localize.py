@@ -10,6 +10,7 @@ import typer
 from semdb.cli.options import CameraOption, JsonFlag, Overrides, settings_options
 
 if TYPE_CHECKING:
+    from semdb.errors import FrameError
     from semdb.localize import ImageLocalization
 
 
@@ -35,7 +36,10 @@ def command(
     plot: Annotated[Path | None, typer.Option("--plot", metavar="DIR", help="Write a picture per image.")] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Find the camera pose of images. A verdict of `failed` is an answer: exit code 0, no pose."""
+    """Find the camera pose of images. A verdict of `failed` is an answer: exit code 0, no pose.
+
+    An image that cannot be read is named on stderr and makes the exit code 1; the others are localized all the same.
+    """
     from semdb.cli.output import print_json
     from semdb.cli.progress import say
     from semdb.database.store import open_store
@@ -48,8 +52,14 @@ def command(
         plot.mkdir(parents=True, exist_ok=True)
     results: list[dict[str, Any]] = []
     pictures: set[Path] = set()
+    broken: list[FrameError] = []
+
+    def unreadable(error: FrameError) -> None:
+        broken.append(error)
+        say(str(error))
+
     with open_store(settings.database_url) as store:
-        for answer in localize_images(images, depth or [], store, settings, options, say=say):
+        for answer in localize_images(images, depth or [], store, settings, options, say=say, unreadable=unreadable):
             if json:
                 results.append(as_json(answer))
             else:
@@ -60,6 +70,8 @@ def command(
                 say(f"wrote {write_picture(plot, store, answer, pictures)}")
     if json:
         print_json(results)
+    if broken:
+        raise typer.Exit(1)
 
 
 def as_json(answer: ImageLocalization) -> dict[str, Any]:

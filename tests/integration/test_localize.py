@@ -110,6 +110,15 @@ def test_an_image_without_texture_fails_as_an_answer(room: Path, url: str, tmp_p
     assert (tmp_path / "plots" / f"{image.stem}.png").is_file()
 
 
+def test_one_broken_image_does_not_stop_the_others(url: str, images: list[Path], tmp_path: Path) -> None:
+    broken = tmp_path / "truncated.png"
+    broken.write_bytes(images[4].read_bytes()[:5000])
+    done = semdb("localize", broken, images[7], "--json", url=url)
+    assert done.returncode == 1
+    assert "truncated.png" in done.stderr
+    assert [answer["verdict"] for answer in json.loads(done.stdout)] == ["localized"]
+
+
 def test_queries_are_logged(url: str, images: list[Path]) -> None:
     before = semdb_json("sql", "SELECT COUNT(*) AS n FROM queries", "--format", "json", url=url)[0]["n"]
     semdb_json("localize", images[10], "--json", url=url)
