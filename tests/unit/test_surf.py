@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import time
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2
@@ -225,6 +229,26 @@ def test_calls_from_several_threads(image: ImageArray, noise: ImageArray) -> Non
             assert_equal(found, right)
 
 
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_forked_process_makes_its_own_threads(noise: ImageArray) -> None:
+    surf = SURF(threads=2)
+    expected = len(surf.extract(noise))
+    with warnings.catch_warnings(action="ignore", category=DeprecationWarning):
+        child = os.fork()
+    if child == 0:
+        os._exit(0 if len(surf.extract(noise)) == expected else 1)
+    for _ in range(200):
+        process, status = os.waitpid(child, os.WNOHANG)
+        if process:
+            break
+        time.sleep(0.05)
+    else:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        pytest.fail("the forked process hangs")
+    assert status == 0
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_region_gives_what_the_whole_image_has_there(noise: ImageArray, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -282,9 +306,13 @@ def test_opencv_calls(noise: ImageArray) -> None:
     assert [k.class_id for k in keypoints] == found.laplacian.tolist()
     assert {k.octave for k in keypoints} == {0, 1, 2}
     assert [k.pt for k in surf.detect(noise)] == [k.pt for k in keypoints]
-    again, same = surf.compute(noise, keypoints)
-    assert [k.angle for k in again] == [k.angle for k in keypoints]
+    again, same = surf.compute(noise, keypoints[::-1])
+    assert [k.angle for k in again] == [k.angle for k in keypoints[::-1]]
+    same = same[::-1]
     np.testing.assert_array_equal(same, descriptors)
+    none, nothing = surf.compute(noise, ())
+    assert none == ()
+    assert nothing.shape == (0, 64)
     assert (surf.descriptorSize(), SURF(extended=True).descriptorSize()) == (64, 128)
     matches = cv2.BFMatcher(surf.defaultNorm()).match(descriptors, same)
     assert all(m.queryIdx == m.trainIdx for m in matches)

@@ -11,6 +11,7 @@ results are those of OpenCV's implementation (`docs/surf.md` compares them); the
 from __future__ import annotations
 
 import math
+import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -30,6 +31,7 @@ from semdb.types import BoolArray, Features, Float32Array, ImageArray, IntArray
 UPRIGHT_ANGLE = 270.0  # what OpenCV gives upright keypoints
 MASK_TILE = 16  # sample rows that share their columns to look at, when there is a mask
 MASK_REACH = 3  # samples around the mask that are looked at
+SCRATCH_BYTES = 16 << 20  # larger arrays, of images above four megapixels, are not kept
 MIN_CHUNK = 64  # keypoints that are worth a task of their own
 _NO_SUMS = np.zeros((1, 1), np.int32)
 
@@ -84,6 +86,7 @@ class SURF:
         self.max_keypoints = int(max_keypoints)
         self.threads = int(threads)
         self._pool: ThreadPoolExecutor | None = None
+        self._pool_process = 0
         self._pool_lock = threading.Lock()
         self._scratch = _Scratch()
         self._largest = (9 + 6 * (self.n_octave_layers + 1)) << (self.n_octaves - 1)
@@ -110,14 +113,14 @@ class SURF:
     def compute(
         self, image: ImageArray, keypoints: Sequence[cv2.KeyPoint]
     ) -> tuple[tuple[cv2.KeyPoint, ...], Float32Array]:
-        """Descriptors of given keypoints, with their angles measured anew.
+        """Descriptors of given keypoints in their order, with their angles measured anew.
 
         Keypoints whose orientation cannot be measured, too near to the border, are left out.
         """
         rows = [(*k.pt, k.size, k.response, max(k.octave, 0), k.class_id) for k in keypoints]
         candidates = np.array(rows, dtype=np.float32).reshape(-1, 6)
         largest = max(self._largest, math.ceil(candidates[:, 2].max(initial=0)))
-        order = np.argsort(-candidates[:, 3], kind="stable")
+        order = np.arange(len(candidates))
         features, octaves = self._describe(self._integral(_checked(image), largest), candidates, order, described=True)
         return _keypoints(features, octaves), features.descriptors.astype(np.float32, copy=False)
 
@@ -273,8 +276,9 @@ class SURF:
         if self.threads == 1 or len(tasks) < 2:
             return [task() for task in tasks]
         with self._pool_lock:
-            if self._pool is None:
+            if self._pool is None or self._pool_process != os.getpid():  # threads do not survive a fork
                 self._pool = ThreadPoolExecutor(self.threads, thread_name_prefix="surf")
+                self._pool_process = os.getpid()
         return [future.result() for future in [self._pool.submit(task) for task in tasks]]
 
 
@@ -296,6 +300,8 @@ class _Scratch(threading.local):
 
     def array(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
         size = math.prod(shape)
+        if size * np.dtype(dtype).itemsize > SCRATCH_BYTES:
+            return np.empty(shape, dtype)
         held = self._arrays.get(name)
         if held is None or held.size < size:
             held = self._arrays[name] = np.empty(size, dtype)
