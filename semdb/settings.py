@@ -28,7 +28,7 @@ class Settings(BaseSettings):
     score_threshold: float = Field(0.5, ge=0.0, le=1.0, description="detections below are not kept")
     max_keypoints: int = Field(1500, ge=50, le=20000, description="keypoints kept per image, by response")
     threads: int = Field(2, ge=1, le=256, description="threads of one process for networks and kernels")
-    cache_dir: Path = Field(Path("~/.cache/semdb"), description="compiled kernels, pulled models and saved indexes")
+    cache_dir: Path = Field(Path("~/.cache/semdb"), description="model files, in models/")
     broker_url: str = Field(
         "redis://localhost:6379/0", description="broker of the workers, redis://HOST:PORT/N or another of Celery's"
     )

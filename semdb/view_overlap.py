@@ -4,13 +4,15 @@ Depth is sampled on a coarse grid once per view; after that a pair costs some mi
 views can be compared with hundreds of keyframes.
 """
 
+# compiled functions take what numba infers
+# mypy: disable-error-code="no-untyped-call"
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
+from semdb.compiled import kernel
 from semdb.geometry import back_project, invert_pose, pixels_to_normalized
 from semdb.types import BoolArray, Camera, Float32Array, FloatArray
 
@@ -92,7 +94,7 @@ def _camera_vector(camera: Camera, step: int) -> FloatArray:
     return np.array([*intrinsics, *distortion, step, limit], dtype=np.float64)
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _overlaps(depth, rays, index, to_other, from_other, camera, floor, overlap):  # type: ignore[no-untyped-def]  # pragma: no cover
     for other in range(depth.shape[0]):
         share = _seen_share(depth[index], rays, to_other[other], depth[other], camera)
@@ -103,7 +105,7 @@ def _overlaps(depth, rays, index, to_other, from_other, camera, floor, overlap):
         overlap[other] = share
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _seen_share(depth, rays, pose, target, camera):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Share of the points of `depth`, moved by `pose`, that the view `target` sees; 0 where too few can be told."""
     width, height, fx, fy, cx, cy, k1, k2, p1, p2, k3, step, limit = camera
@@ -141,7 +143,7 @@ def _seen_share(depth, rays, pose, target, camera):  # type: ignore[no-untyped-d
     return seen / told
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _compare(target, u, v, z):  # type: ignore[no-untyped-def]  # pragma: no cover
     """1 when one of the four samples around (u, v) has depth z, 0 when none, -1 when none is valid."""
     rows, columns = target.shape

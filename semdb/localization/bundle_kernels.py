@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from semdb.perception.features._jit import kernel
+from semdb.compiled import kernel
 from semdb.types import FloatArray, IntArray
 
 

@@ -7,13 +7,15 @@ exact on planes) instead of that of a pixel up to half a pixel away. Pixels at d
 the step, so no surface is invented between foreground and background; what the depth camera did not see is NaN.
 """
 
+# compiled functions take what numba infers
+# mypy: disable-error-code="no-untyped-call"
 from __future__ import annotations
 
 from functools import lru_cache
 
-import numba
 import numpy as np
 
+from semdb.compiled import kernel
 from semdb.geometry import back_project, normalized_to_pixels
 from semdb.recordings.cameras import SEVEN_SCENES_DEPTH
 from semdb.recordings.seven_scenes import COLOR_FROM_DEPTH
@@ -58,7 +60,7 @@ def _rotated_rays() -> Float32Array:  # [3, 480, 640]
     return np.ascontiguousarray(turned, dtype=np.float32)
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy", fastmath=True)
+@kernel(fastmath=True)
 def _rasterise(depth, u, v, inverse_z, max_step, nearest):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Both triangles of each 2x2 block: the diagonal from top right to bottom left is shared."""
     rows, columns = depth.shape
@@ -80,7 +82,7 @@ def _rasterise(depth, u, v, inverse_z, max_step, nearest):  # type: ignore[no-un
                 )  # fmt: skip
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy", fastmath=True, inline="always")
+@kernel(fastmath=True, inline="always")
 def _triangle(ua, va, wa, ub, vb, wb, uc, vc, wc, nearest):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Writes 1/z of one triangle where it is the nearest surface; pixel centres are whole numbers."""
     area = (ub - ua) * (vc - va) - (vb - va) * (uc - ua)

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from semdb.perception.features import _jit
+from semdb import compiled
 from semdb.perception.features.surf import SURF
 
 
@@ -57,18 +57,18 @@ def triple(x: int) -> int:
 def test_kernel_without_a_cache_folder_works_and_says_so(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    njit: Callable[..., Any] = _jit.numba.njit
+    njit: Callable[..., Any] = compiled.numba.njit
 
     def no_folder(function: Callable[..., Any], **options: Any) -> Any:
         if options.get("cache"):
             raise RuntimeError(f"cannot cache function {function.__name__!r}: no locator available")
         return njit(function, **options)
 
-    monkeypatch.setattr(_jit.numba, "njit", no_folder)
-    _jit._warn_uncached.cache_clear()
+    monkeypatch.setattr(compiled.numba, "njit", no_folder)
+    compiled._warn_uncached.cache_clear()
     with caplog.at_level(logging.WARNING):
-        compiled = [_jit.kernel(double), _jit.kernel(triple)]
-    assert [f(21) for f in compiled] == [42, 63]
+        functions = [compiled.kernel(double), compiled.kernel(triple)]
+    assert [f(21) for f in functions] == [42, 63]
     assert len(caplog.records) == 1
     assert "NUMBA_CACHE_DIR" in caplog.text
 
@@ -78,7 +78,7 @@ def test_named_cache_folder_that_cannot_be_written_is_named(
 ) -> None:
     file = tmp_path / "file"
     file.write_text("in the way")
-    monkeypatch.setattr(_jit.numba.config, "CACHE_DIR", str(file / "cache"))
+    monkeypatch.setattr(compiled.numba.config, "CACHE_DIR", str(file / "cache"))
     with caplog.at_level(logging.WARNING):
-        assert _jit.kernel(double)(4) == 8
+        assert compiled.kernel(double)(4) == 8
     assert str(file / "cache") in caplog.text

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from semdb.perception.features._jit import kernel
+from semdb.compiled import kernel
 
 GRID = 20  # gradients across the descriptor window, each of size s
 CELLS = GRID + 1  # means of grey across it

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from semdb.perception.features._jit import kernel
+from semdb.compiled import kernel
 
 COLUMNS = 6  # of a candidate: x, y, size, response, octave, sign of the Laplacian
 DXY_WEIGHT = np.float32(0.81)  # 0.9 squared: balances the box filters against Gaussian derivatives

@@ -9,18 +9,18 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
+
+from semdb.compiled import kernel
 
 BOX, FRUSTUM, ELLIPSOID, ROOM = 0, 1, 2, 3
 TILE = 8  # pixels
 SUBSAMPLES = 3  # per pixel side, at edges
 PROBES = 8  # most texture probes along the long axis of a pixel's footprint
 FAR = 1e30
-njit = numba.njit(nogil=True, cache=True, error_model="numpy")
 
 
-@njit
+@kernel
 def _hit_box(ox, oy, oz, dx, dy, dz, hx, hy, hz, inside):
     """Entry (or exit when `inside`) of a box: (t, face); face is 2 * axis + (1 on the negative side)."""
     t_in, t_out, f_in, f_out = -FAR, FAR, 0, 0
@@ -51,7 +51,7 @@ def _hit_box(ox, oy, oz, dx, dy, dz, hx, hy, hz, inside):
     return (t_in, f_in) if t_in > 0 else (FAR, 0)
 
 
-@njit
+@kernel
 def _hit_frustum(ox, oy, oz, dx, dy, dz, r0, r1, h):
     """First hit of a capped cone along z: radius `r0` at -h, `r1` at +h. Face 0 side, 1 top, 2 bottom."""
     rm, k = 0.5 * (r0 + r1), 0.5 * (r1 - r0) / h
@@ -75,7 +75,7 @@ def _hit_frustum(ox, oy, oz, dx, dy, dz, r0, r1, h):
     return best, face
 
 
-@njit
+@kernel
 def hit(kind, ox, oy, oz, dx, dy, dz, hx, hy, hz, top):
     """First hit of a primitive in its own frame: (t, face), t = FAR for none."""
     if kind == BOX or kind == ROOM:
@@ -92,7 +92,7 @@ def hit(kind, ox, oy, oz, dx, dy, dz, hx, hy, hz, top):
     return (t, 0) if t > 0 else (FAR, 0)
 
 
-@njit
+@kernel
 def surface(kind, face, x, y, z, hx, hy, hz, top):
     """(u, v) 0..1, outward normal and the gradients of u and v, of point (x, y, z) on a face: 11 numbers."""
     if kind == BOX or kind == ROOM:
@@ -125,7 +125,7 @@ def surface(kind, face, x, y, z, hx, hy, hz, top):
     return u, v, nx / norm, ny / norm, nz / norm, -qy / (hx * turn), qx / (hy * turn), 0.0, 0.0, 0.0, gv
 
 
-@njit
+@kernel
 def _fetch(texels, offset, w, h, wrap, x, y):
     """Bilinear sample (r, g, b) at texel coordinates (x, y) of one level."""
     x -= 0.5
@@ -149,7 +149,7 @@ def _fetch(texels, offset, w, h, wrap, x, y):
     )
 
 
-@njit
+@kernel
 def _texture(texels, table, tex, u, v, jux, jvx, juy, jvy):
     """The texture `tex` filtered over a pixel's footprint: (r, g, b).
 
@@ -187,7 +187,7 @@ def _texture(texels, table, tex, u, v, jux, jvx, juy, jvy):
     return red / probes, green / probes, blue / probes
 
 
-@njit
+@kernel
 def _light(lightmap, offset, nu, nv, curved, u, v):
     """The baked light (r, g, b) at (u, v) of a face."""
     x, y = u * nu - 0.5, v * nv - 0.5
@@ -209,7 +209,7 @@ def _light(lightmap, offset, nu, nv, curved, u, v):
     )
 
 
-@njit
+@kernel
 def _closest(ids, start, stop, kind, o, m, half, top, near, x, y):
     """Nearest primitive of a tile along the camera ray (x, y, 1): (t, primitive, face). `ids` are sorted by `near`."""
     best, prim, face = FAR, -1, 0
@@ -228,7 +228,7 @@ def _closest(ids, start, stop, kind, o, m, half, top, near, x, y):
     return best, prim, face
 
 
-@njit
+@kernel
 def _shade(kind, half, top, ftex, fuv, fmap, tint, texels, table, lightmap, i, face, t, x, y, step, o, m):
     """The colour (r, g, b) of primitive `i` hit at depth `t` by the ray (x, y, 1); pixels are `step` apart."""
     dx = m[i, 0, 0] * x + m[i, 0, 1] * y + m[i, 0, 2]
@@ -257,7 +257,7 @@ def _shade(kind, half, top, ftex, fuv, fmap, tint, texels, table, lightmap, i, f
     return r, g, b
 
 
-@njit
+@kernel
 def cast(kind, half, top, tiles, ids, o, m, near, focal, cx, cy, depth, prims):
     """First pass: writes depth ``[H, W]`` (z of pixel centres, 0 for none) and prims (8 * primitive + face, or -1).
 
@@ -275,7 +275,7 @@ def cast(kind, half, top, tiles, ids, o, m, near, focal, cx, cy, depth, prims):
                 prims[v, u] = 8 * i + f
 
 
-@njit
+@kernel
 def shade(
     kind,
     half,

@@ -11,10 +11,11 @@ import math
 
 import numpy as np
 
-from semdb.recordings.synthetic.kernels import BOX, FAR, FRUSTUM, ROOM, hit, njit, surface
+from semdb.compiled import kernel
+from semdb.recordings.synthetic.kernels import BOX, FAR, FRUSTUM, ROOM, hit, surface
 
 
-@njit
+@kernel
 def trace(bvh_box, bvh_link, order, kind, rot, centre, half, top, px, py, pz, dx, dy, dz, t_max, stack):
     """Nearest primitive along ``p + t d`` in the world, ``t < t_max``: (t, primitive or -1, face).
 
@@ -62,7 +63,7 @@ def trace(bvh_box, bvh_link, order, kind, rot, centre, half, top, px, py, pz, dx
     return best, prim, face
 
 
-@njit
+@kernel
 def bake(bvh_box, bvh_link, order, world, fmap, mean, lamps, dirs, reach, ambient, lightmap):
     """Fills `lightmap` ``[texels, 3]`` with the light that each texel of each face receives.
 
@@ -150,7 +151,7 @@ def bake(bvh_box, bvh_link, order, world, fmap, mean, lamps, dirs, reach, ambien
                             light[c] += ambient * near * mean[hit, f, c] / dirs.shape[0]
 
 
-@njit
+@kernel
 def _face_point(kind, face, u, v, half, top, p):
     """Writes the point at (u, v) of a face: the inverse of `_surface`."""
     if kind == BOX or kind == ROOM:

@@ -1,5 +1,7 @@
 """Baked light, culling and the call of the compiled renderer."""
 
+# compiled functions take what numba infers
+# mypy: disable-error-code="no-untyped-call"
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
