@@ -1,7 +1,8 @@
 # make demo   install the base into .venv and run the demonstration (no setting, no model file needed)
 # make test   install everything, MariaDB included, then lint, types and all tests
 # make lint   ruff and mypy            make lock    write requirements/constraints.txt anew
-# make bench  all benchmarks           make wheel   dist/*.whl           make clean   remove what make made
+# make bench  all benchmarks, on RECORDINGS="..." or a rendered room
+# make wheel  dist/*.whl               make clean   remove what make made
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
@@ -53,10 +54,16 @@ lint: $(VENV)/.stamp-dev
 lock:
 	@scripts/lock.sh $(LOCK)
 
-bench: $(VENV)/.stamp-dev
+# recordings that the benchmarks run on; a rendered room where none is named
+RECORDINGS ?= bench-output/room
+
+bench-output/room: | $(VENV)/.stamp-dev
+	$(BIN)/semdb synth $@
+
+bench: $(VENV)/.stamp-dev $(RECORDINGS)
 	@for file in bench/[a-z]*.py; do \
 	  name=$$(basename "$$file" .py); mkdir -p bench-output; \
-	  echo "== bench.$$name"; $(BIN)/python -m "bench.$$name" --json "bench-output/$$name.json"; \
+	  echo "== bench.$$name"; $(BIN)/python -m "bench.$$name" $(RECORDINGS) --json "bench-output/$$name.json"; \
 	done
 
 wheel: $(VENV)/.stamp-dev

@@ -36,8 +36,8 @@ def test_synthetic_bars(results: dict[str, Any]) -> None:
     assert (semantic["keyframes"], semantic["queries"]) == (16, 40)
     assert semantic["success_rate"] >= 0.98
     assert semantic["false_localizations"] == 0
-    assert semantic["median_translation_m"] <= 0.005
-    assert semantic["median_rotation_deg"] <= 0.1
+    assert semantic["median_translation_m"] <= 0.002
+    assert semantic["median_rotation_deg"] <= 0.05
 
 
 def test_semantics_rank_less_and_lose_nothing(results: dict[str, Any]) -> None:
@@ -47,10 +47,10 @@ def test_semantics_rank_less_and_lose_nothing(results: dict[str, Any]) -> None:
     assert semantic["ranked_share"] <= 0.6 < blind["ranked_share"]
 
 
-def test_not_behind_the_reference_that_knows_the_right_keyframes(results: dict[str, Any]) -> None:
+def test_as_many_within_5_cm_as_the_reference_that_knows_the_right_keyframes(results: dict[str, Any]) -> None:
     semantic, reference = results["semdb"], results["sift-reference"]
-    assert semantic["median_translation_m"] <= reference["median_translation_m"]
     assert semantic["recall"]["5cm_5deg"] >= reference["recall"]["5cm_5deg"]
+    assert semantic["success_rate"] >= reference["success_rate"]
 
 
 def test_query_depth_is_better_again(recording: Path, results: dict[str, Any], tmp_path: Path) -> None:
