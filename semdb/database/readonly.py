@@ -121,8 +121,8 @@ def _server_rows(engine: Engine, settings: Settings, sql: str) -> Generator[Row,
 
     try:
         pooled = engine.raw_connection()
-    except SQLAlchemyError as error:
-        raise retry.explain(engine, error) from error
+    except (SQLAlchemyError, pymysql.err.MySQLError) as error:  # the pool passes the driver's own errors on
+        raise retry.explain(engine, error, setting="SEMDB_READER_URL") from error
     connection = pooled.driver_connection
     try:
         _prepare(connection, settings.sql_time_limit_s, safe_url(engine.url))

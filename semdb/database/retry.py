@@ -67,9 +67,9 @@ def _run(engine: Engine, work: Callable[[Connection], T], *, write: bool) -> T:
     raise AssertionError("unreachable")
 
 
-def error_code(error: SQLAlchemyError) -> int | None:
-    """The server's error number, None where there is none (SQLite)."""
-    arguments = getattr(getattr(error, "orig", None), "args", ())
+def error_code(error: Exception) -> int | None:
+    """The server's error number, of SQLAlchemy's errors and the driver's; None where there is none (SQLite)."""
+    arguments = getattr(getattr(error, "orig", None) or error, "args", ())
     return arguments[0] if arguments and isinstance(arguments[0], int) else None
 
 
@@ -88,20 +88,22 @@ def is_transient(error: DBAPIError, *, answered: bool = True) -> bool:
     return name.startswith(("SQLITE_BUSY", "SQLITE_LOCKED"))
 
 
-def explain(engine: Engine, error: SQLAlchemyError, attempts: int = 1) -> DatabaseError:
-    """The error for people: which database, what it said, what to do."""
+def explain(
+    engine: Engine, error: Exception, attempts: int = 1, *, setting: str = "SEMDB_DATABASE_URL"
+) -> DatabaseError:
+    """The error for people: which database, what it said, what to do. `setting` is where its URL came from."""
     where = safe_url(engine.url)
     reason = str(getattr(error, "orig", None) or error).splitlines()[0]
     code = error_code(error)
     name = getattr(getattr(error, "orig", None), "sqlite_errorname", "") or ""
     if code in _UNREACHABLE or (code in _LOST and engine not in _answered):
-        advice = "does not answer: check that the server runs and that host and port of SEMDB_DATABASE_URL are right"
+        advice = f"does not answer: check that the server runs and that host and port of {setting} are right"
     elif code in _DENIED:
-        advice = "refuses: check user, password and schema of SEMDB_DATABASE_URL, and the account's rights"
+        advice = f"refuses: check user, password and schema of {setting}, and the account's rights"
     elif name == "SQLITE_CANTOPEN":
         advice = "cannot be opened: check that its folder exists and can be written"
     elif name == "SQLITE_NOTADB":
-        advice = "is not a database: check the path of SEMDB_DATABASE_URL"
+        advice = f"is not a database: check the path of {setting}"
     elif name.startswith("SQLITE_CORRUPT"):
         advice = "is damaged: restore it from a backup, or delete the file and ingest again"
     elif name.startswith(("SQLITE_BUSY", "SQLITE_LOCKED")):

@@ -50,6 +50,10 @@ def test_each_account_does_its_work_and_no_more(accounts: dict[str, str], monkey
     monkeypatch.setenv("SEMDB_READER_URL", accounts["reader"])
     query = "SELECT COUNT(*) AS keyframes, SUM(frame_index) AS frames FROM keyframes"
     assert json.loads(run("sql", query, "--format", "json").stdout) == [{"keyframes": 5, "frames": 42}]
+    wrong = make_url(accounts["reader"]).set(password="wrong").render_as_string(hide_password=False)
+    monkeypatch.setenv("SEMDB_READER_URL", wrong)
+    assert "check user, password and schema of SEMDB_READER_URL" in run("sql", query, code=1).stderr
+    monkeypatch.setenv("SEMDB_READER_URL", accounts["reader"])
     assert "refused" in run("sql", "SELECT 1 INTO OUTFILE '/tmp/semdb-never'", code=1).stderr
 
     assert run("delete", "recording", "first visit", "--yes").stdout.endswith("5 keyframes\n")

@@ -286,6 +286,15 @@ def test_sql_on_a_server_needs_a_reader() -> None:
     assert "SEMDB_READER_URL" in result.stderr
 
 
+def test_sql_on_a_server_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    server = "mysql+pymysql://ann:secret@127.0.0.1:9/semdb"
+    monkeypatch.setenv("SEMDB_READER_URL", server)
+    result = run("sql", "SELECT 1", "--database-url", server, code=1)
+    assert "does not answer" in result.stderr
+    assert "SEMDB_READER_URL" in result.stderr
+    assert "secret" not in result.stderr
+
+
 def test_accounts_are_printed_as_sql() -> None:
     output = run("init", "--accounts", "--database-url", "mysql+pymysql://root:top@127.0.0.1:9/maps").stdout
     statements = [line for line in output.splitlines() if not line.startswith("-- ")]
