@@ -49,7 +49,7 @@ def test_no_pose_or_next_to_none_is_failed() -> None:
         ({"spread": 0.125}, 0, "small part"),
         ({"covariance": np.diag([1e-2, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6])}, 0, "0.10 m"),
         ({"covariance": np.diag([1e-6] * 5 + [np.radians(3) ** 2])}, 0, "3.0 deg"),
-        ({}, 90, "elsewhere has 90 against 120"),
+        ({}, 60, "elsewhere has 60 against 80"),
     ],
 )
 def test_every_doubt_makes_it_ambiguous_and_is_named(changes: dict[str, object], rival: int, words: str) -> None:
