@@ -113,8 +113,8 @@ def cascade(
     if use_classes:
         passed = source.filtered(counts, options.minimum_share)
         yield from _stage(Stage.FILTERED, sorted(passed), passed, cosines, seen, options.filtered_batches, 0.0)
-        if not options.cascade:
-            return
+    if options.use_classes and not options.cascade:
+        return  # the hard filter has the last word, also where no object is detected
     everything = list(source.keyframe_ids())
     scores = source.class_scores(counts) if use_classes else {}
     if use_classes:

@@ -21,10 +21,14 @@ class SqlSource:
     def __init__(self, store: Store, map_id: int) -> None:
         self._store = store
         self._map_id = map_id
+        self._seen: list[int] | None = None
 
     def refresh(self) -> bool:
-        """Nothing is kept, so nothing can be out of date."""
-        return False
+        """Nothing is kept here, but what others keep of the map is out of date when its keyframes are others."""
+        ids = self._store.keyframe_ids(self._map_id)
+        changed = self._seen is not None and ids != self._seen
+        self._seen = ids
+        return changed
 
     def keyframe_ids(self) -> Sequence[int]:
         return self._store.keyframe_ids(self._map_id)
@@ -55,8 +59,8 @@ class MemorySource:
         self._counts: IntArray = np.zeros((0, 0), np.int32)  # [classes, keyframes]
         self._classes: dict[str, int] = {}
         self._vectors: Float32Array = np.zeros((0, 0), np.float32)
-        self.refresh()
-        self._load()
+        if not self.refresh():
+            self._load()
 
     def refresh(self) -> bool:
         """Rereads the map if it changed since the last call; whether it did."""

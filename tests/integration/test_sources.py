@@ -40,3 +40,22 @@ def test_the_mirror_answers_as_sql_does_while_the_map_changes(store: Store, seed
     assert memory.refresh()
     assert len(memory.keyframe_ids()) == 16
     assert_equal_answers(memory, sql, seed + 2)
+
+
+def test_the_reference_notices_too_that_the_keyframes_are_others(store: Store) -> None:
+    map_id, _, _ = fill(store, name="first", frame_indexes=range(5))
+    sql = SqlSource(store, map_id)
+    assert [sql.refresh(), sql.refresh()] == [False, False]
+    store.delete_keyframes(store.keyframe_ids(map_id)[:1])
+    assert [sql.refresh(), sql.refresh()] == [True, False]
+    fill(store, name="second", frame_indexes=range(2))
+    assert sql.refresh()
+
+
+def test_a_new_mirror_is_loaded_once(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    map_id, _, _ = fill(store, name="first", frame_indexes=range(5))
+    loads: list[int] = []
+    load = store.load_vectors
+    monkeypatch.setattr(store, "load_vectors", lambda ids: (loads.append(len(ids)), load(ids))[1])
+    MemorySource(store, map_id)
+    assert loads == [5]

@@ -92,6 +92,10 @@ def test_the_paper_stops_after_the_filter() -> None:
     assert set(source.asked) == {2, 3}
 
 
+def test_the_paper_looks_at_nothing_without_objects() -> None:
+    assert run(CoarseOptions(cascade=False, filtered_batches=(1,)), counts={})[0] == []
+
+
 def test_nothing_passes_the_filter() -> None:
     source = FakeSource({}, SOURCE_VECTORS)
     batches = list(cascade(source, {"zebra": 1.0}, QUERY, CoarseOptions()))
