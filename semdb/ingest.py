@@ -83,21 +83,21 @@ def ingest_recordings(
             raise UsageError(f"--name names one recording, but {len(recordings)} were found")
         recordings[0].name = options.name
     _check_names(recordings)
-    store = open_store(settings.database_url, create=True)
     describers: dict[object, Describer] = {}
-    summaries = []
-    for recording in recordings:
-        map_models = map_models_of(store, options.map_name or default_map_name(recording))
-        specs = specs_for_ingest(settings, map_models, has_masks=recording.categories is not None)
-        for note in (*recording.notes, *specs.notes):
-            (say or _nobody)(f"{recording.name}: {note}")
-        own = settings_of_map(settings, map_models)
-        key = (specs, own.score_threshold, own.max_keypoints)
-        if key not in describers:
-            describers[key] = describer_from_specs(specs.detector, specs.encoder, specs.features, own)
-        summary = ingest_recording(recording, store, describers[key], options, progress=progress)
-        summary.notes = (*recording.notes, *specs.notes)
-        summaries.append(summary)
+    summaries: list[IngestSummary] = []
+    with open_store(settings.database_url, create=True) as store:
+        for recording in recordings:
+            map_models = map_models_of(store, options.map_name or default_map_name(recording))
+            specs = specs_for_ingest(settings, map_models, has_masks=recording.categories is not None)
+            for note in (*recording.notes, *specs.notes):
+                (say or _nobody)(f"{recording.name}: {note}")
+            own = settings_of_map(settings, map_models)
+            key = (specs, own.score_threshold, own.max_keypoints)
+            if key not in describers:
+                describers[key] = describer_from_specs(specs.detector, specs.encoder, specs.features, own)
+            summary = ingest_recording(recording, store, describers[key], options, progress=progress)
+            summary.notes = (*recording.notes, *specs.notes)
+            summaries.append(summary)
     return summaries
 
 
@@ -126,7 +126,7 @@ def ingest_recording(
         recording=recording.name,
         recording_id=plan.recording_id,
         total_frames=recording.total_frames,
-        usable_frames=len(recording.entries),
+        usable_frames=len(recording.entries) - len(recording.decode_failures),
         planned=len(entries),
         already_stored=len(plan.stored),
         models=describer.models,
@@ -209,7 +209,7 @@ def _plan(
     plan = RecordingPlan(
         name=recording.name,
         format=recording.format,
-        source=str(recording.path),
+        source=str(recording.path.absolute()),
         frame_count=recording.total_frames,
         fingerprint=fingerprint(recording),
         frame_indexes=tuple(entry.index for entry in entries),

@@ -28,7 +28,8 @@ class ModelSpecs:
 def specs_for_ingest(settings: Settings, map_models: Sequence[ModelInfo], *, has_masks: bool) -> ModelSpecs:
     """What describes a recording: the settings, else what the map was described by, else what needs no file.
 
-    `has_masks` tells whether the recording brings object masks. Raises UsageError when no detector is at hand.
+    `has_masks` tells whether the recording brings object masks. Raises UsageError when no detector is at hand, or
+    masks are to be the detections and there are none.
     """
     known = {model.role: model for model in map_models}
     chosen: dict[str, str] = {}
@@ -51,6 +52,11 @@ def specs_for_ingest(settings: Settings, map_models: Sequence[ModelInfo], *, has
         raise UsageError(
             "this recording brings no object masks, so a detector is needed: set SEMDB_DETECTOR=onnx:FILE "
             "(a Mask R-CNN as ONNX, see docs/models.md) or pass --detector"
+        )
+    if chosen["detector"] == "recorded" and not has_masks:
+        raise UsageError(
+            "the detector is 'recorded', but this recording brings no object masks: set SEMDB_DETECTOR=onnx:FILE or "
+            "pass --detector, and --map where the map holds recordings with masks"
         )
     return ModelSpecs(chosen["detector"], chosen["encoder"], chosen["features"], tuple(notes))
 

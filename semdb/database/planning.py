@@ -157,10 +157,14 @@ def _resume(connection: Connection, row: Row[Any], plan: RecordingPlan, map_name
     for what, old, new in (
         ("format", row.format, plan.format),
         ("number of frames", row.frame_count, plan.frame_count),
-        ("fingerprint", row.fingerprint, plan.fingerprint),
     ):
         if old != new:
             raise UsageError(f"{name} is stored already and is another one: its {what} is {old}, not {new}; {advice}")
+    if row.fingerprint != plan.fingerprint:
+        raise UsageError(
+            f"{name} is stored already and is another one: its camera, or which frames can be used, their times or "
+            f"their poses are others now; {advice}"
+        )
     query = select(ingest_items.c.frame_index, ingest_items.c.state).where(ingest_items.c.recording_id == row.id)
     states = {row.frame_index: row.state for row in connection.execute(query.order_by(ingest_items.c.frame_index))}
     if set(states) != set(plan.frame_indexes):

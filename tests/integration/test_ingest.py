@@ -160,6 +160,22 @@ def test_a_broken_keyframe_fails_and_the_rest_goes_on(room: Path, tmp_path: Path
     assert (again.stored, again.already_stored, again.failed) == (1, 5, {})
 
 
+def test_frames_add_up_and_the_source_is_absolute(room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    copy = tmp_path / "broken"
+    shutil.copytree(room, copy)
+    depth = sorted((copy / "depth").iterdir())
+    for number, position in ((8, -2000), (9, -3)):  # damaged in the middle, and cut off
+        data = bytearray(depth[number].read_bytes())
+        data[position] ^= 0xFF
+        depth[number].write_bytes(data if number == 8 else data[:position])
+    url = f"sqlite:///{tmp_path / 'broken.sqlite3'}"
+    monkeypatch.chdir(tmp_path)
+    [summary] = ingest_recordings([Path("broken")], settings(url), IngestOptions(keyframes=3))
+    assert (summary.total_frames, summary.usable_frames, len(summary.dropped)) == (24, 22, 2)
+    with open_store(url) as store:
+        assert store.status()[0].source == str(copy)
+
+
 def test_other_models_and_other_plans_are_refused(room: Path, tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path / 'one.sqlite3'}"
     ingest_recordings([room], settings(url), IngestOptions(keyframes=3, map_name="m"))

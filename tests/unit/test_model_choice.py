@@ -34,6 +34,16 @@ def test_a_new_map_takes_what_needs_no_file_and_says_so(settings: Settings) -> N
         specs_for_ingest(settings, (), has_masks=False)
 
 
+def test_masks_that_are_not_there_cannot_be_the_detections(settings: Settings) -> None:
+    named = settings.model_copy(update={"detector": "recorded"})
+    assert specs_for_ingest(named, (), has_masks=True).detector == "recorded"
+    with pytest.raises(UsageError, match="brings no object masks"):
+        specs_for_ingest(named, (), has_masks=False)
+    rendered = (ModelInfo("detector", "recorded", "", "{}"), *MAP[1:])
+    with pytest.raises(UsageError, match="brings no object masks"):
+        specs_for_ingest(settings, rendered, has_masks=False)
+
+
 def test_what_is_named_is_taken_without_a_word(settings: Settings) -> None:
     named = settings.model_copy(update={"detector": "onnx:a.onnx", "encoder": "onnx:b.onnx", "features": "orb"})
     specs = specs_for_ingest(named, MAP, has_masks=True)

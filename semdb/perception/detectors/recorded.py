@@ -26,8 +26,8 @@ class RecordedDetector:
         """
         if instances is None:
             raise UsageError(
-                "this image brings no masks, so the detector 'recorded' has nothing to give: name a detector, "
-                "e.g. SEMDB_DETECTOR=onnx:FILE with a Mask R-CNN"
+                "this image brings no masks, so the detector 'recorded' has nothing to give: it is for images that "
+                "lie in a recording with masks; for others the map must be ingested with SEMDB_DETECTOR=onnx:FILE"
             )
         labels = instances.labels
         if labels.shape != image.shape[:2]:
