@@ -51,10 +51,15 @@ class _MapLocalizer:
     localizer: Localizer
 
 
-def make_localizer(store: Store, info: MapInfo, coarse: str, options: LocalizerOptions | None = None) -> Localizer:
-    """The localizer of one map. Raises UsageError for a `coarse` that is neither ``sql`` nor ``index``."""
+def check_coarse(coarse: str) -> None:
+    """Raises UsageError for what is neither ``sql`` nor ``index``."""
     if coarse not in COARSE:
         raise UsageError(f"--coarse {coarse}: known are sql and index")
+
+
+def make_localizer(store: Store, info: MapInfo, coarse: str, options: LocalizerOptions | None = None) -> Localizer:
+    """The localizer of one map. Raises UsageError for a `coarse` that is neither ``sql`` nor ``index``."""
+    check_coarse(coarse)
     source = SqlSource(store, info.id) if coarse == "sql" else MemorySource(store, info.id)
     return Localizer(info.name, store.map_models(info.id), source, KeyframeCache(store, info.id), options)
 

@@ -52,6 +52,7 @@ def command(
     from semdb.recordings import parse_camera
 
     settings = overrides.settings()
+    check_outputs(json_file, report)
     results: list[EvaluationResult] = []
     for count in parse_counts(keyframes):
         options = EvaluateOptions(
@@ -73,6 +74,23 @@ def command(
         from semdb.evaluation.report import write_report
 
         say(f"wrote {write_report(report, results, settings=used_settings(settings, coarse, query_depth))}")
+
+
+def check_outputs(json_file: Path | None, report: Path | None) -> None:
+    """Raises UsageError where the results could not be written in the end, before anything is computed."""
+    import os
+
+    from semdb.errors import UsageError
+
+    if json_file is not None:
+        target = json_file if json_file.exists() else json_file.parent
+        if json_file.is_dir() or not target.exists() or not os.access(target, os.W_OK):
+            raise UsageError(f"--json {json_file}: cannot be written there; name a file in a folder that exists")
+    if report is not None:
+        try:
+            report.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UsageError(f"--report {report}: the folder cannot be made: {error.strerror}") from error
 
 
 def parse_counts(text: str | None) -> list[int | None]:

@@ -144,6 +144,10 @@ class SiftReference:
             raise UsageError("sift-reference needs at least one keyframe")
         self._poses = np.stack([keyframe.pose for keyframe in self._keyframes])
 
+    def __len__(self) -> int:
+        """How many keyframes it has."""
+        return len(self._keyframes)
+
     def localize(self, frame: Frame) -> Localization:
         """The pose of `frame`, or verdict `failed` below 12 inliers. There is no confidence (NaN) or covariance.
 

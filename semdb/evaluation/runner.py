@@ -12,12 +12,12 @@ from semdb.errors import FrameError
 from semdb.evaluation.baselines import SiftReference, nearest_in_pose
 from semdb.evaluation.methods import ORACLE, SEMDB, SIFT_REFERENCE, Method, method_named
 from semdb.evaluation.metrics import EvaluationResult, QueryResult, query_result, summarise
-from semdb.evaluation.protocols import PAPER, split_paper
+from semdb.evaluation.protocols import PAPER, evenly_spaced, split_paper
 from semdb.evaluation.workspace import evaluation_store
 from semdb.ingest import IngestOptions, ingest_recording
 from semdb.keyframes import select_keyframes
 from semdb.localization.localizer import Localizer
-from semdb.localize import make_localizer
+from semdb.localize import check_coarse, make_localizer
 from semdb.model_choice import specs_for_ingest
 from semdb.perception.describe import Describer, describer_from_specs
 from semdb.recordings import open_recordings
@@ -54,6 +54,9 @@ def evaluate(
     """
     options = options or EvaluateOptions()
     methods = [method_named(name) for name in options.methods]
+    check_coarse(options.coarse)
+    if options.max_queries is not None:
+        evenly_spaced(0, options.max_queries)  # says now what would be wrong with it later
     recordings = [found for path in paths for found in open_recordings(path, options.camera)]
     results = []
     for recording in recordings:
@@ -63,6 +66,9 @@ def evaluate(
                 say(f"{recording.name}: {note}")
         describers = _Describers(specs.detector, specs.encoder, specs.features, settings)
         results += _evaluate_recording(recording, describers, methods, settings, options, progress)
+        if say is not None:
+            for line in _unusable(recording):
+                say(line)
     return results
 
 
@@ -96,9 +102,9 @@ def _evaluate_recording(
         if progress is not None:
             progress(f"selecting keyframes of {recording.name}", done, total)
 
-    keyframes = select_keyframes(recording, count=options.keyframes, progress=selecting)
-    queries = split_paper(recording.entries, keyframes, options.max_queries)
-    with evaluation_store(settings.database_url) as store:
+    with evaluation_store(settings.database_url) as store:  # first: it may not answer, and selecting takes long
+        keyframes = select_keyframes(recording, count=options.keyframes, progress=selecting)
+        queries = split_paper(recording.entries, keyframes, options.max_queries)
         runs = [_open_run(method, recording, keyframes, describers, store, options, progress) for method in methods]
         answers: list[list[QueryResult]] = [[] for _ in runs]
         for done, frame in enumerate(_read(recording, queries), start=1):
@@ -115,9 +121,20 @@ def _evaluate_recording(
             method=run.name,
             models=run.models,
             frames=recording.total_frames,
-            keyframes=len(keyframes),
+            keyframes=run.keyframes,
         )
         for run, found in zip(runs, answers, strict=True)
+    ]
+
+
+def _unusable(recording: Recording) -> list[str]:
+    """A line about the frames that were neither keyframe nor query, none where all were fit for it."""
+    unusable = (*recording.dropped, *recording.decode_failures)
+    if not unusable:
+        return []
+    return [
+        f"{recording.name}: {len(unusable)} of {recording.total_frames} frames could not be used, the first "
+        f"{unusable[0].name}: {unusable[0].reason} (semdb recording {recording.path} names all)"
     ]
 
 
@@ -134,31 +151,30 @@ def _read(recording: Recording, queries: Sequence[FrameEntry]) -> Iterator[tuple
 
 
 class _Run:
-    """A method, ready to answer."""
+    """A method, ready to answer. `keyframes` is how many it has: those that could be read."""
 
-    def __init__(self, name: str, models: tuple[ModelInfo, ...]) -> None:
+    def __init__(self, name: str, models: tuple[ModelInfo, ...], keyframes: int) -> None:
         self.name = name
         self.models = models
+        self.keyframes = keyframes
 
     def answer(self, frame: Frame, decode_ms: float, described: dict[int, tuple[Description, float]]) -> QueryResult:
         """The result for one frame. `described` shares descriptions between the methods of one query."""
         localization, timing = self.localize(frame, described)
         timing = {"decode": decode_ms, **timing, **localization.timing_ms}
-        timing["total"] = sum(
-            timing.get(stage, 0.0) for stage in ("decode", "describe", "filter", "rank", "match", "pose")
-        )
-        timing.pop("describe", None)
+        timing["total"] = decode_ms + timing.pop("describe") + timing.pop("localize")
         return query_result(frame.name, frame.index, localization, frame.world_from_camera, timing_ms=timing)
 
     def localize(
         self, frame: Frame, described: dict[int, tuple[Description, float]]
     ) -> tuple[Localization, dict[str, float]]:
+        """The answer, and wall times; `describe` and `localize` among them, which are whole."""
         raise TypeError(f"{type(self).__name__} answers nothing")
 
 
 class _LocalizerRun(_Run):
     def __init__(self, method: Method, describer: Describer, localizer: Localizer, query_depth: bool) -> None:
-        super().__init__(method.name, describer.models)
+        super().__init__(method.name, describer.models, len(localizer.cache.poses()[0]))
         self._describer = describer
         self._localizer = localizer
         self._query_depth = query_depth
@@ -179,7 +195,9 @@ class _LocalizerRun(_Run):
         self, frame: Frame, described: dict[int, tuple[Description, float]]
     ) -> tuple[Localization, dict[str, float]]:
         description, timing = self.describe(frame, described)
-        return self._localizer.localize(description), timing
+        started = time.perf_counter()
+        found = self._localizer.localize(description)
+        return found, {**timing, "localize": (time.perf_counter() - started) * 1000}
 
 
 class _OracleRun(_LocalizerRun):
@@ -193,19 +211,22 @@ class _OracleRun(_LocalizerRun):
         description, timing = self.describe(frame, described)
         ids, poses = self._localizer.cache.poses()
         chosen = [ids[position] for position in nearest_in_pose(frame.world_from_camera, poses)]
-        return self._localizer.localize_among(description, chosen), timing
+        started = time.perf_counter()
+        found = self._localizer.localize_among(description, chosen)
+        return found, {**timing, "localize": (time.perf_counter() - started) * 1000}
 
 
 class _SiftRun(_Run):
     def __init__(self, reference: SiftReference) -> None:
-        super().__init__(SIFT_REFERENCE, reference.models)
+        super().__init__(SIFT_REFERENCE, reference.models, len(reference))
         self._reference = reference
 
     def localize(
         self, frame: Frame, described: dict[int, tuple[Description, float]]
     ) -> tuple[Localization, dict[str, float]]:
         found = self._reference.localize(frame)
-        return found, {"describe": found.timing_ms.get("features", 0.0)}
+        features = found.timing_ms["features"]
+        return found, {"describe": features, "localize": found.timing_ms["total"] - features}
 
 
 def _open_run(
@@ -218,12 +239,16 @@ def _open_run(
     progress: Progress | None,
 ) -> _Run:
     if method.name == SIFT_REFERENCE:
-        return _SiftRun(SiftReference((recording.read(entry) for entry in keyframes), recording=recording.name))
+        frames = (frame for frame, _ in _read(recording, keyframes))
+        return _SiftRun(SiftReference(frames, recording=recording.name))
     describer = describers.of(method)
     map_name = describer.features.info.name  # one map per kind of features: rows of two kinds do not mix
     if all(info.name != map_name for info in store.maps()):
         ingest = IngestOptions(map_name=map_name, keyframes=options.keyframes)
-        ingest_recording(recording, store, describer, ingest, progress=progress, entries=keyframes)
+        summary = ingest_recording(recording, store, describer, ingest, progress=progress, entries=keyframes)
+        for entry in keyframes:
+            if entry.index in summary.failed:
+                recording.note_decode_failure(entry, FrameError(summary.failed[entry.index]))
     localizer = make_localizer(store, store.find_map(map_name), options.coarse, method.options)
     run = _OracleRun if method.name == ORACLE else _LocalizerRun
     return run(method, describer, localizer, options.query_depth)

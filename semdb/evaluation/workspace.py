@@ -11,10 +11,12 @@ from pathlib import Path
 from sqlalchemy import text
 from sqlalchemy.exc import DBAPIError
 
-from semdb.database import schema
+from semdb.database import retry, schema
 from semdb.database.engine import make_engine, parse_url, safe_url, sqlite_path
 from semdb.database.store import Store, open_store
 from semdb.errors import DatabaseError
+
+_NOT_ALLOWED = {1044, 1142, 1227}  # the account is known and has not the right
 
 
 @contextlib.contextmanager
@@ -50,9 +52,11 @@ def _run(database_url: str, statement: str) -> None:
         with engine.begin() as connection:
             connection.execute(text(statement))
     except DBAPIError as error:
+        if retry.error_code(error) not in _NOT_ALLOWED:
+            raise retry.explain(engine, error) from error
         raise DatabaseError(
             f"{safe_url(engine.url)}: {statement} was refused ({error.orig}). An evaluation works in a schema of its "
-            "own: use an account that may create one (the owner), or SEMDB_DATABASE_URL=sqlite:///FILE"
+            "own: use an account that may create schemas, or SEMDB_DATABASE_URL=sqlite:///FILE"
         ) from error
     finally:
         engine.dispose()

@@ -224,6 +224,56 @@ def test_evaluate_writes_what_the_contract_names(room: Path, url: str, tmp_path:
     assert semdb_json("sql", "SELECT COUNT(*) AS n FROM maps", "--format", "json", url=url) == [{"n": 1}]
 
 
+def damage(path: Path) -> None:
+    """Spoils an image in its middle: its header and its end stay right."""
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    path.write_bytes(data)
+
+
+def test_evaluate_counts_and_names_frames_that_cannot_be_read(room: Path, tmp_path: Path) -> None:
+    worn = tmp_path / "worn"
+    shutil.copytree(room, worn)
+    for image in sorted((worn / "rgb").iterdir())[1:13:2]:
+        damage(image)
+    done = semdb(
+        *("evaluate", worn, "--keyframes", 20, "--method", "semdb", "--method", "sift-reference"),
+        *("--json", tmp_path / "e.json"),
+        url=f"sqlite:///{tmp_path / 'unused.sqlite3'}",
+    )
+    assert done.returncode == 0, done.stderr
+    for result in json.loads((tmp_path / "e.json").read_text()):
+        assert result["keyframes"] < 20  # six are broken, and four frames are no keyframes
+        assert result["keyframes"] + result["queries"] == 18
+    assert "6 of 24 frames could not be used" in done.stderr
+    assert "wrong checksum" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--json", "missing/e.json"], "--json missing/e.json"),
+        (["--json", "."], "cannot be written"),
+        (["--coarse", "hash"], "known are sql and index"),
+        (["--max-queries", "0"], "at least one query"),
+    ],
+)
+def test_evaluate_says_at_once_what_would_be_wrong_in_the_end(
+    room: Path, tmp_path: Path, arguments: list[str], words: str
+) -> None:
+    # the server is not asked: nothing answers at this address
+    done = semdb("evaluate", room, *arguments, url="mysql+pymysql://ann:secret@127.0.0.1:9/semdb", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert words in done.stderr
+
+
+def test_evaluate_on_a_server_that_does_not_answer(room: Path) -> None:
+    done = semdb("evaluate", room, url="mysql+pymysql://ann:secret@127.0.0.1:9/semdb")
+    assert done.returncode == 1
+    assert "does not answer" in done.stderr
+    assert "secret" not in done.stderr
+
+
 def test_evaluate_on_a_server_gives_the_same_figures_and_leaves_nothing(
     room: Path, mariadb_url: str, tmp_path: Path
 ) -> None:
