@@ -174,10 +174,13 @@ def map_models_of(store: Store, map_name: str) -> tuple[ModelInfo, ...]:
     return ()
 
 
-def fingerprint(recording: Recording) -> str:
-    """SHA-256 over format, camera and the frames' names, times and poses: tells recordings of one name apart."""
+def fingerprint(recording: Recording, keyframes: Sequence[FrameEntry]) -> str:
+    """SHA-256 over format, camera and the keyframes' names, times and poses: tells recordings of one name apart.
+
+    Other frames are not in it, so a recording whose broken files were mended is still the same one.
+    """
     digest = hashlib.sha256(f"{recording.format}|{recording.camera}|{recording.depth_scale}".encode())
-    for entry in recording.entries:
+    for entry in keyframes:
         digest.update(f"|{entry.index}|{entry.name}|{entry.timestamp_ns}".encode())
         if entry.world_from_camera is not None:
             digest.update(entry.world_from_camera.astype("<f8").tobytes())
@@ -211,7 +214,7 @@ def _plan(
         format=recording.format,
         source=str(recording.path.absolute()),
         frame_count=recording.total_frames,
-        fingerprint=fingerprint(recording),
+        fingerprint=fingerprint(recording, entries),
         frame_indexes=tuple(entry.index for entry in entries),
     )
     return store.plan_recording(store.ensure_map(map_name), plan, describer.models)

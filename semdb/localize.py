@@ -10,7 +10,7 @@ from pathlib import Path
 from semdb.database.planning import check_models
 from semdb.database.records import MapInfo
 from semdb.database.store import Store
-from semdb.errors import FrameError, NotFoundError, ProvenanceError, UsageError
+from semdb.errors import DatabaseError, FrameError, NotFoundError, ProvenanceError, UsageError
 from semdb.localization.keyframe_cache import KeyframeCache
 from semdb.localization.localizer import Localizer, LocalizerOptions
 from semdb.localization.sources import MemorySource, SqlSource
@@ -101,8 +101,17 @@ def localize_images(
         timing["total"] = (time.perf_counter() - started) * 1000
         localization = replace(localization, timing_ms=timing)
         map_id = next(entry.info.id for entry in maps if entry.info.name == localization.map_name)
-        store.log_query(map_id, str(path), localization)
+        _log(store, map_id, path, localization, say)
         yield ImageLocalization(query, description, localization)
+
+
+def _log(store: Store, map_id: int, path: Path, localization: Localization, say: Callable[[str], None] | None) -> None:
+    """An answer is given also where it cannot be logged, as with an account that may only read."""
+    try:
+        store.log_query(map_id, str(path), localization)
+    except DatabaseError as error:
+        if say is not None:
+            say(f"the answer for {path} is not in the log of queries: {error}")
 
 
 def _open_maps(

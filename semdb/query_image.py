@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from semdb.errors import RecordingError, UsageError
+from semdb.errors import FrameError, RecordingError, UsageError
 from semdb.recordings import open_recordings, read_depth_image, read_query_image
 from semdb.recordings.base import FrameEntry, Recording
 from semdb.recordings.cameras import with_size
@@ -61,7 +61,7 @@ class QueryReader:
     def read(self, path: Path, depth_path: Path | None = None) -> QueryImage:
         """The image at `path` with depth from `depth_path`, which must be registered to it and of its size.
 
-        Raises FrameError for a file that cannot be read, UsageError when its camera is not known.
+        Raises FrameError for a file that cannot be read or whose camera is not known.
         """
         image = read_query_image(path)
         size = (image.shape[1], image.shape[0])
@@ -99,14 +99,14 @@ class QueryReader:
         if len(fitting) == 1:
             self._tell("camera of the images: that of the map's keyframes (--camera or --like name another)")
             return fitting.pop(), scale
-        raise UsageError(
+        raise FrameError(
             f"the camera of {path} ({size[0]}x{size[1]}) is not known: give --camera fx,fy,cx,cy[,k1,k2,p1,p2,k3], "
             "or --like RECORDING"
         )
 
     def _check_size(self, camera: Camera, size: tuple[int, int], path: Path, origin: str) -> None:
         if (camera.width, camera.height) != size:
-            raise UsageError(
+            raise FrameError(
                 f"{path} is {size[0]}x{size[1]}, but the camera of {origin} is {camera.width}x{camera.height}: "
                 "give --camera fx,fy,cx,cy"
             )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -24,7 +25,7 @@ class Settings(BaseSettings):
     )
     encoder: str = Field("auto", description="auto, onnx:FILE or gist. auto: a query takes the map's own")
     features: str = Field("auto", description="auto, surf, sift or orb. auto: the map's own, or surf")
-    device: str = Field("cpu", description="device of the torch models")
+    device: Literal["cpu"] = Field("cpu", description="device of the networks; this version runs them on the CPU")
     score_threshold: float = Field(0.5, ge=0.0, le=1.0, description="detections below are not kept")
     max_keypoints: int = Field(1500, ge=50, le=20000, description="keypoints kept per image, by response")
     threads: int = Field(2, ge=1, le=256, description="threads of one process for networks and kernels")

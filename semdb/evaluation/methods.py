@@ -55,6 +55,7 @@ METHODS = {
                 pose=PoseOptions(matching=MatchingOptions(evidence=Evidence.OBJECTS), guided=False),
                 verdict=_COUNT_ONLY,
                 neighbours=0,
+                twins=0,
             ),
         ),
         Method(
@@ -65,6 +66,7 @@ METHODS = {
                 pose=PoseOptions(guided=False, bundle=False),
                 verdict=_COUNT_ONLY,
                 neighbours=0,
+                twins=0,
             ),
             features="orb",
         ),

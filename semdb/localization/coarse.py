@@ -16,6 +16,8 @@ import numpy as np
 
 from semdb.types import Float32Array, FloatArray
 
+FOLLOWING = 30  # keyframes after those of a batch that are looked through for a place that looks the same
+
 
 class Stage:
     """Names of the stages, as results and the query log record them."""
@@ -55,6 +57,7 @@ class Batch:
     stage: str
     proposals: tuple[Proposal, ...]
     ranked: int
+    following: tuple[Proposal, ...] = ()  # what comes next in the same order, as far as it may look alike
 
 
 class CoarseSource(Protocol):
@@ -146,5 +149,8 @@ def _stage(
         if not chosen:
             return
         seen.update(keyframe_ids[p] for p in chosen)
-        proposals = tuple(Proposal(keyframe_ids[p], float(classes[p]), float(cosine[p])) for p in chosen)
-        yield Batch(name, proposals, len(cosines))
+        proposals, following = (
+            tuple(Proposal(keyframe_ids[p], float(classes[p]), float(cosine[p])) for p in positions)
+            for positions in (chosen, order[start : start + FOLLOWING])
+        )
+        yield Batch(name, proposals, len(cosines), following)

@@ -19,6 +19,8 @@ from semdb.localization.verdict import Judgement, VerdictOptions, convinces, jud
 from semdb.localization.views import KeyframeView, View, make_view
 from semdb.types import Candidate, Description, Float32Array, FloatArray, Localization, ModelInfo, Verdict
 
+FAR = 4.0  # 0.3 m and 15 degrees count as 1: keyframes nearer than this may see the same things
+
 
 @dataclass(frozen=True, slots=True)
 class LocalizerOptions:
@@ -28,6 +30,8 @@ class LocalizerOptions:
     pose: PoseOptions = field(default_factory=PoseOptions)
     verdict: VerdictOptions = field(default_factory=VerdictOptions)
     neighbours: int = 1  # keyframes near the first pose that join once it convinces
+    twins: int = 1  # keyframes far from the pose that are asked when they look as much like the query
+    twin_cosine: float = 0.05  # how much less than the best keyframe's cosine is "as much"
 
 
 @dataclass(slots=True)
@@ -39,6 +43,7 @@ class _Search:
     matches: list[Matches] = field(default_factory=list)
     proposals: list[Proposal] = field(default_factory=list)
     estimate: PoseEstimate | None = None
+    following: tuple[Proposal, ...] = ()
     stage: str = Stage.FILTERED
     ranked: int = 0
     timing_ms: dict[str, float] = field(default_factory=lambda: {"filter": 0.0, "rank": 0.0, "match": 0.0, "pose": 0.0})
@@ -105,6 +110,7 @@ class Localizer:
     def _try(self, search: _Search, batch: Batch) -> None:
         search.stage, search.ranked = batch.stage, batch.ranked
         search.proposals += batch.proposals
+        search.following = batch.following
         self._match(search, [proposal.keyframe_id for proposal in batch.proposals])
         self._estimate(search)
 
@@ -123,6 +129,7 @@ class Localizer:
     def _conclude(self, search: _Search) -> Localization:
         if convinces(search.estimate, self.options.verdict) and search.stage != Stage.GIVEN:
             self._ask_neighbours(search)
+            self._ask_twins(search)
         started = time.perf_counter()
         rival = 0
         if search.estimate is not None:
@@ -142,7 +149,7 @@ class Localizer:
             for i, pose in zip(ids, poses, strict=True)
         ]
         nearest = [int(n) for n in np.argsort(distance, kind="stable")[: self.options.neighbours]]
-        chosen = [ids[n] for n in nearest if distance[n] < 4.0]
+        chosen = [ids[n] for n in nearest if distance[n] < FAR]
         if not chosen:
             return
         before = search.estimate
@@ -151,6 +158,31 @@ class Localizer:
         self._estimate(search)
         if search.estimate is None or search.estimate.inliers < before.inliers:
             search.estimate = before
+
+    def _ask_twins(self, search: _Search) -> None:
+        """A keyframe far from the pose that looks as much like the query may show a place that is the same twice.
+
+        Its pairs do not join the pose; they are there for `rival_pose`. On the recordings of docs/localization.md the
+        best far keyframe is 0.07 or more behind in cosine for 99 of 100 queries, so hardly any query pays for this.
+        """
+        known = [proposal.cosine for proposal in search.proposals if np.isfinite(proposal.cosine)]
+        if search.estimate is None or not known:
+            return
+        limit = max(known) - self.options.twin_cosine
+        ids, poses = self.cache.poses()
+        position = {keyframe_id: n for n, keyframe_id in enumerate(ids)}
+        matched = {keyframe.keyframe_id for keyframe in search.keyframes}
+        chosen = [
+            proposal
+            for proposal in search.following
+            if proposal.cosine >= limit
+            and proposal.keyframe_id not in matched
+            and proposal.keyframe_id in position
+            and _pose_distance(search.estimate.world_from_camera, poses[position[proposal.keyframe_id]]) >= FAR
+        ][: self.options.twins]
+        if chosen:
+            search.proposals += chosen
+            self._match(search, [proposal.keyframe_id for proposal in chosen])
 
     def _result(self, search: _Search, judgement: Judgement) -> Localization:
         estimate = search.estimate if judgement.verdict is not Verdict.FAILED else None

@@ -22,7 +22,7 @@ class PoseOptions:
     """Pixels are of the query image."""
 
     matching: MatchingOptions = field(default_factory=MatchingOptions)
-    max_reprojection_px: float = 6.0
+    max_reprojection_px: float = 5.0
     inlier_px: float = 4.0
     pixel_sigma_px: float = 1.0
     guided: bool = True
@@ -61,6 +61,7 @@ class PoseEstimate:
     inliers: int
     per_keyframe: tuple[int, ...]
     first_inliers: int
+    first_of_best: int  # those with the keyframe that has most of them
     agreement: float
     residual_px: float  # median reprojection error of the inliers
     spread: float  # 0..1: share of a 4x4 grid over the image that holds inliers
@@ -190,11 +191,12 @@ def estimate_pose(
     return _estimate(query, keyframes, pairs, points, camera_from_world, covariance, first, options)
 
 
-def _first_support(pairs: Pairs, agreeing: BoolArray) -> tuple[int, float]:
-    """Pairs that agree before any is guided, and their share of the pairs with the keyframe that has most of them."""
+def _first_support(pairs: Pairs, agreeing: BoolArray) -> tuple[int, int, float]:
+    """Pairs that agree before any is guided: of all keyframes, of the best one, and the share of that one's pairs."""
     counts = np.bincount(pairs.slot[agreeing])
     best = int(counts.argmax())
-    return len(np.unique(pairs.query[agreeing])), float(counts[best] / np.count_nonzero(pairs.slot == best))
+    tried = np.count_nonzero(pairs.slot == best)
+    return len(np.unique(pairs.query[agreeing])), int(counts[best]), float(counts[best] / tried)
 
 
 def rival_pose(
@@ -208,7 +210,7 @@ def rival_pose(
 
     Elsewhere is more than 0.5 m or 15 degrees away; 0 when there is none.
     """
-    pairs = join_pairs(matches[: len(best.per_keyframe)])
+    pairs = join_pairs(matches)
     points = world_points_of(pairs, keyframes)
     camera_from_world = invert_pose(best.world_from_camera)
     left = reprojection_px(query, camera_from_world, pairs.query, points) >= 2 * options.max_reprojection_px
@@ -229,7 +231,7 @@ def _estimate(
     points: FloatArray,
     camera_from_world: FloatArray,
     covariance: FloatArray | None,
-    first: tuple[int, float],
+    first: tuple[int, int, float],
     options: PoseOptions,
 ) -> PoseEstimate | None:
     error = reprojection_px(query, camera_from_world, pairs.query, points)
@@ -244,7 +246,8 @@ def _estimate(
         inliers=len(np.unique(inliers.query)),
         per_keyframe=tuple(int((inliers.slot == slot).sum()) for slot in range(len(keyframes))),
         first_inliers=first[0],
-        agreement=first[1],
+        first_of_best=first[1],
+        agreement=first[2],
         residual_px=float(np.median(error[keep])),
         spread=image_spread(query, inliers.query),
     )

@@ -29,7 +29,7 @@ class VerdictOptions:
     minimum_spread: float = 0.19  # three cells of a 4x4 grid over the image
     maximum_translation_sigma_m: float = 0.05
     maximum_rotation_sigma_deg: float = 2.0
-    rival_share: float = 0.7  # of the first inliers that a pose elsewhere may have at most
+    rival_share: float = 0.7  # of the first inliers with the best keyframe, that a pose elsewhere may have at most
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,8 +93,9 @@ def judge(estimate: PoseEstimate | None, rival_inliers: int, options: VerdictOpt
         doubts.append(f"the position is uncertain by {position:.2f} m")
     if estimate.covariance is not None and rotation > options.maximum_rotation_sigma_deg:
         doubts.append(f"the rotation is uncertain by {rotation:.1f} deg")
-    if rival_inliers > options.rival_share * estimate.first_inliers:  # neither counts what a pose has guided
-        doubts.append(f"a pose elsewhere has {rival_inliers} against {estimate.first_inliers} inliers")
+    # like with like: nothing that a pose has guided, and one keyframe, since of a place elsewhere one was asked
+    if rival_inliers > options.rival_share * estimate.first_of_best:
+        doubts.append(f"a pose elsewhere has {rival_inliers} against {estimate.first_of_best} inliers")
     if doubts:
         return Judgement(Verdict.AMBIGUOUS, min(confidence, 0.5), "; ".join(doubts))
     return Judgement(Verdict.LOCALIZED, confidence, f"{estimate.inliers} keypoints agree")

@@ -119,6 +119,26 @@ def test_one_broken_image_does_not_stop_the_others(url: str, images: list[Path],
     assert [answer["verdict"] for answer in json.loads(done.stdout)] == ["localized"]
 
 
+def test_a_place_that_is_there_twice_is_ambiguous(room: Path, images: list[Path], tmp_path: Path) -> None:
+    """The same room again, five metres away in the same map: no image can tell the two apart."""
+    twin = tmp_path / "twin"
+    shutil.copytree(room, twin)
+    lines = (twin / "groundtruth.txt").read_text().splitlines()
+    moved = [line.split() for line in lines if not line.startswith("#")]
+    shifted = [" ".join([time, str(float(x) + 5), *rest]) for time, x, *rest in moved]
+    (twin / "groundtruth.txt").write_text("\n".join(shifted) + "\n")
+    made = f"sqlite:///{tmp_path / 'twins.sqlite3'}"
+    settings = Settings(database_url=made, detector="recorded", encoder="gist", features="surf", threads=1)
+    for recording in (room, twin):
+        ingest_recordings([recording], settings, IngestOptions(stride=4, map_name="one"))
+    answers = semdb_json("localize", *images[2::7], "--json", url=made)
+    assert len(answers) == 4
+    for answer in answers:
+        assert answer["verdict"] == "ambiguous"
+        assert "elsewhere" in answer["reason"]
+        assert answer["confidence"] <= 0.5
+
+
 def test_queries_are_logged(url: str, images: list[Path]) -> None:
     before = semdb_json("sql", "SELECT COUNT(*) AS n FROM queries", "--format", "json", url=url)[0]["n"]
     semdb_json("localize", images[10], "--json", url=url)

@@ -20,6 +20,7 @@ GOOD = PoseEstimate(
     inliers=120,
     per_keyframe=(120,),
     first_inliers=80,
+    first_of_best=80,
     agreement=0.7,
     residual_px=0.8,
     spread=0.6,
