@@ -20,6 +20,7 @@ _COUNT_ONLY = VerdictOptions(
     localized_inliers=12,
     many_first_inliers=12,
     ambiguous_inliers=12,
+    ambiguous_first_inliers=12,
     convincing_inliers=12,
     minimum_spread=0.0,
     maximum_translation_sigma_m=float("inf"),

@@ -80,7 +80,9 @@ def test_another_kitchen_is_not_found(shared_dir: Path, tmp_path: Path) -> None:
     desk = sorted((shared_dir / FREIBURG / "rgb").iterdir())[::10]
     answers = semdb_json("localize", *desk, "--map", "kitchen", "--json", url=url, **settings)
     assert len(answers) == 13
-    assert [answer["verdict"] for answer in answers].count("localized") == 0
+    verdicts = [answer["verdict"] for answer in answers]
+    assert verdicts.count("localized") == 0
+    assert verdicts.count("failed") >= 12
     kitchen = sorted((shared_dir / RED_KITCHEN / "seq-01").glob("*.color.jpg"))[2::50]
     found = semdb_json("localize", *kitchen, "--json", url=url, **settings)
     assert [answer["verdict"] for answer in found] == ["localized"] * 5

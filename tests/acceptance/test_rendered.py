@@ -6,10 +6,13 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from semdb.geometry import pose_error, pose_from, rotation_from_quat_wxyz
+from semdb.recordings import open_recording
 from semdb.recordings.synthetic import SyntheticOptions
-from tests.rooms import render, semdb
+from tests.rooms import render, semdb, semdb_json
 
 
 @pytest.fixture(scope="module")
@@ -63,3 +66,46 @@ def test_query_depth_is_better_again(recording: Path, results: dict[str, Any], t
     deep = json.loads((tmp_path / "e.json").read_text())
     assert deep["success_rate"] >= results["semdb"]["success_rate"]
     assert deep["mean_translation_m"] < results["semdb"]["mean_translation_m"]
+
+
+@pytest.fixture(scope="module")
+def first_visit(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A database with a map of 14 keyframes of a noisy recording of a whole room."""
+    folder = tmp_path_factory.mktemp("visits")
+    recording = render(folder / "first", SyntheticOptions(frames=60, lap_frames=60, noise=True))
+    url = f"sqlite:///{folder / 'semdb.sqlite3'}"
+    done = semdb("ingest", recording, "--map", "room", "--keyframes", 14, url=url)
+    assert done.returncode == 0, done.stderr
+    return url
+
+
+def localize(recording: Path, url: str, step: int) -> list[dict[str, Any]]:
+    images = sorted((recording / "rgb").iterdir())[::step]
+    found = semdb_json("localize", *images, "--map", "room", "--json", "--coarse", "index", url=url)
+    assert isinstance(found, list)
+    return found
+
+
+def test_a_second_visit_with_moved_objects_other_light_and_blur(first_visit: str, tmp_path: Path) -> None:
+    options = SyntheticOptions(frames=60, lap_frames=60, seed=5, second_visit=True, lighting=0.6, blur=0.4, noise=True)
+    recording = render(tmp_path / "second", options)
+    truth = {entry.image_path.name: entry.world_from_camera for entry in open_recording(recording).entries}
+    answers = localize(recording, first_visit, 2)
+    errors = []
+    for answer in answers:
+        if answer["verdict"] == "localized":
+            pose = pose_from(rotation_from_quat_wxyz(answer["pose"]["quat_wxyz"]), answer["pose"]["position"])
+            true_pose = truth[Path(answer["image"]).name]
+            assert true_pose is not None
+            errors.append(pose_error(pose, true_pose))
+    assert len(errors) >= 0.9 * len(answers)
+    assert sum(metres > 0.25 or degrees > 5 for metres, degrees in errors) == 0
+    assert np.median([metres for metres, _ in errors]) < 0.03
+
+
+def test_another_room_is_failed_not_found(first_visit: str, tmp_path: Path) -> None:
+    recording = render(tmp_path / "other", SyntheticOptions(frames=40, lap_frames=40, room_seed=7, noise=True))
+    verdicts = [answer["verdict"] for answer in localize(recording, first_visit, 2)]
+    assert len(verdicts) == 20
+    assert verdicts.count("localized") == 0
+    assert verdicts.count("failed") >= 17

@@ -64,11 +64,14 @@ def test_few_pairs_that_agree_well_are_enough() -> None:
     assert judge(replace(GOOD, first_inliers=10, agreement=0.36), 0, OPTIONS).verdict is Verdict.LOCALIZED
 
 
-def test_a_wrong_pose_fed_by_guided_matches_does_not_pass() -> None:
+def test_a_wrong_pose_fed_by_guided_matches_is_failed() -> None:
     """30 guided inliers, 12 of 70 before: seen on a real recording, 1.3 m off."""
-    wrong = replace(GOOD, inliers=30, first_inliers=12, agreement=12 / 70, spread=0.4)
-    assert judge(wrong, 0, OPTIONS).verdict is Verdict.AMBIGUOUS
+    wrong = replace(GOOD, inliers=30, first_inliers=12, first_of_best=12, agreement=12 / 70, spread=0.4)
+    found = judge(wrong, 0, OPTIONS)
+    assert (found.verdict, found.confidence) == (Verdict.FAILED, 0.0)
     assert not convinces(wrong, OPTIONS)
+    for doubtful in ({"agreement": 0.25}, {"first_inliers": 17}):
+        assert judge(replace(wrong, **doubtful), 0, OPTIONS).verdict is Verdict.AMBIGUOUS
 
 
 def test_confidence_grows_with_support_and_falls_with_a_rival() -> None:
