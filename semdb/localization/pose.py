@@ -239,18 +239,28 @@ def _estimate(
     if keep.sum() < MINIMUM_PAIRS or not np.isfinite(camera_from_world).all():
         return None
     inliers = pairs.take(keep)
+    residual_px = float(np.median(error[keep]))
     return PoseEstimate(
         world_from_camera=invert_pose(camera_from_world),
-        covariance=covariance,
+        covariance=None if covariance is None else covariance * _excess_variance(residual_px, options),
         pairs=inliers,
         inliers=len(np.unique(inliers.query)),
         per_keyframe=tuple(int((inliers.slot == slot).sum()) for slot in range(len(keyframes))),
         first_inliers=first[0],
         first_of_best=first[1],
         agreement=first[2],
-        residual_px=float(np.median(error[keep])),
+        residual_px=residual_px,
         spread=image_spread(query, inliers.query),
     )
+
+
+def _excess_variance(residual_px: float, options: PoseOptions) -> float:
+    """By how much the residuals exceed the noise that was assumed (a blurred query): at least 1.
+
+    With noise of sigma in both images the median distance of a pair is 1.177 sqrt(2) sigma (Rayleigh).
+    """
+    expected = float(np.sqrt(2 * np.log(2)) * np.sqrt(2)) * options.pixel_sigma_px
+    return max(1.0, residual_px / expected) ** 2
 
 
 def image_spread(query: View, rows: IntArray) -> float:

@@ -25,14 +25,15 @@ class VerdictOptions:
     many_first_inliers: int = 25
     few_first_inliers: int = 10
     agreement_of_few: float = 0.35
+    many_inliers: int = 90  # or so many in the end, which chance does not reach either
     ambiguous_inliers: int = 8
     ambiguous_first_inliers: int = 16  # of all keyframes; or
     ambiguous_first_of_best: int = 8  # with the best keyframe, if they are
     ambiguous_agreement: float = 0.2  # of its pairs
     convincing_inliers: int = 60  # and `many_first_inliers`: enough to stop looking at more keyframes
     minimum_spread: float = 0.19  # three cells of a 4x4 grid over the image
-    maximum_translation_sigma_m: float = 0.05
-    maximum_rotation_sigma_deg: float = 2.0
+    maximum_translation_sigma_m: float = 0.035
+    maximum_rotation_sigma_deg: float = 1.5
     rival_share: float = 0.7  # of the first inliers with the best keyframe, that a pose elsewhere may have at most
 
 
@@ -77,13 +78,14 @@ def _is_plausible(estimate: PoseEstimate, options: VerdictOptions) -> bool:
         estimate.first_of_best >= options.ambiguous_first_of_best and estimate.agreement >= options.ambiguous_agreement
     )
     return estimate.inliers >= options.ambiguous_inliers and (
-        by_best or estimate.first_inliers >= options.ambiguous_first_inliers
+        by_best or estimate.first_inliers >= options.ambiguous_first_inliers or estimate.inliers >= options.many_inliers
     )
 
 
 def _first_support_is_enough(estimate: PoseEstimate, options: VerdictOptions) -> bool:
     few = estimate.first_inliers >= options.few_first_inliers and estimate.agreement >= options.agreement_of_few
-    return few or estimate.first_inliers >= options.many_first_inliers
+    many = estimate.first_inliers >= options.many_first_inliers or estimate.inliers >= options.many_inliers
+    return few or many
 
 
 def judge(estimate: PoseEstimate | None, rival_inliers: int, options: VerdictOptions) -> Judgement:

@@ -45,8 +45,8 @@ def test_no_pose_or_next_to_none_is_failed() -> None:
     ("changes", "rival", "words"),
     [
         ({"inliers": 19}, 0, "only 19 keypoints"),
-        ({"first_inliers": 9, "agreement": 0.9}, 0, "without the pose as a guide only 9"),
-        ({"first_inliers": 24, "agreement": 0.3}, 0, "30%"),
+        ({"inliers": 80, "first_inliers": 9, "agreement": 0.9}, 0, "without the pose as a guide only 9"),
+        ({"inliers": 80, "first_inliers": 24, "agreement": 0.3}, 0, "30%"),
         ({"spread": 0.125}, 0, "small part"),
         ({"covariance": np.diag([1e-2, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6])}, 0, "0.10 m"),
         ({"covariance": np.diag([1e-6] * 5 + [np.radians(3) ** 2])}, 0, "3.0 deg"),
@@ -62,6 +62,12 @@ def test_every_doubt_makes_it_ambiguous_and_is_named(changes: dict[str, object],
 
 def test_few_pairs_that_agree_well_are_enough() -> None:
     assert judge(replace(GOOD, first_inliers=10, agreement=0.36), 0, OPTIONS).verdict is Verdict.LOCALIZED
+
+
+def test_very_many_inliers_are_enough_however_few_agreed_at_first() -> None:
+    guided = replace(GOOD, inliers=129, first_inliers=14, first_of_best=6, agreement=0.15)
+    assert judge(guided, 0, OPTIONS).verdict is Verdict.LOCALIZED
+    assert judge(replace(guided, inliers=60), 0, OPTIONS).verdict is Verdict.FAILED
 
 
 def test_a_wrong_pose_fed_by_guided_matches_is_failed() -> None:
