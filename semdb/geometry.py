@@ -7,6 +7,8 @@ import numpy.typing as npt
 
 from semdb.types import Camera, Float32Array, FloatArray
 
+POSE_UNIT_M, POSE_UNIT_DEG = 0.3, 15.0  # so far apart two poses are at `pose_distances` of 1
+
 
 def project_to_so3(matrix: npt.ArrayLike) -> FloatArray:
     """The rotation nearest to `matrix` ``[3, 3]`` in the Frobenius norm (polar decomposition by SVD).
@@ -126,6 +128,23 @@ def pose_error(estimate: FloatArray, truth: FloatArray) -> tuple[float, float]:
     """Distance in metres and angle in degrees between two ``[4, 4]`` poses."""
     distance = float(np.linalg.norm(estimate[:3, 3] - truth[:3, 3]))
     return distance, rotation_angle_deg(estimate[:3, :3].T @ truth[:3, :3])
+
+
+def pose_distances(pose: FloatArray, poses: FloatArray) -> FloatArray:
+    """How far `poses` ``[n, 4, 4]`` are from `pose` ``[4, 4]``, ``[n]``: metres / 0.3 plus degrees / 15, no unit."""
+    metres = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1)
+    relative = pose[:3, :3].T @ poses[:, :3, :3]
+    # atan2 of the sine (from the skew part) and the cosine (from the trace): exact near 0, safe near 180 degrees
+    skew_part = np.stack(
+        [
+            relative[:, 2, 1] - relative[:, 1, 2],
+            relative[:, 0, 2] - relative[:, 2, 0],
+            relative[:, 1, 0] - relative[:, 0, 1],
+        ],
+        axis=1,
+    )
+    angles = np.degrees(np.arctan2(np.linalg.norm(skew_part, axis=1), np.trace(relative, axis1=1, axis2=2) - 1))
+    return np.asarray(metres / POSE_UNIT_M + angles / POSE_UNIT_DEG)
 
 
 def project(camera: Camera, points: npt.ArrayLike) -> FloatArray:

@@ -7,13 +7,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from semdb.errors import FrameError, RecordingError, UsageError
+from semdb.geometry import pose_distances
 from semdb.recordings.base import FrameEntry, Recording
 from semdb.types import FloatArray, IntArray
 
 # Gives one keyframe in 9 frames of freiburg1_rpy (5 Hz) and one in 15 of 7-Scenes' red kitchen (7.5 Hz).
 MIN_OVERLAP = 0.7
-POSE_DISTANCE_M = 0.3
-POSE_DISTANCE_DEG = 15.0
 
 Progress = Callable[[int, int], None]
 OverlapWith = Callable[[int, FloatArray], FloatArray]
@@ -76,21 +75,10 @@ def farthest_views(
         chosen.append(current)
         greatest = np.maximum(greatest, overlap_with(current, greatest))
         greatest[current] = np.inf
-        distance = np.minimum(distance, pose_distances(poses, current))
+        distance = np.minimum(distance, pose_distances(poses[current], poses))
         if len(chosen) == (n if count is None else count) or (count is None and greatest.min() >= min_overlap):
             return np.array(chosen, dtype=np.int32)
         current = int(np.lexsort((-distance, greatest))[0])
-
-
-def pose_distances(poses: FloatArray, index: int) -> FloatArray:
-    """Distance / 0.3 m + angle / 15 degrees ``[n]`` between all `poses` ``[n, 4, 4]`` and one of them."""
-    metres = np.linalg.norm(poses[:, :3, 3] - poses[index, :3, 3], axis=1)
-    relative = poses[index, :3, :3].T @ poses[:, :3, :3]
-    # atan2 of the sine (from the skew part) and the cosine (from the trace): exact near 0, safe near 180 degrees
-    skew = np.stack([relative[:, 2, 1] - relative[:, 1, 2], relative[:, 0, 2] - relative[:, 2, 0]], axis=1)
-    skew = np.column_stack([skew, relative[:, 1, 0] - relative[:, 0, 1]])
-    angles = np.degrees(np.arctan2(np.linalg.norm(skew, axis=1), np.trace(relative, axis1=1, axis2=2) - 1))
-    return np.asarray(metres / POSE_DISTANCE_M + angles / POSE_DISTANCE_DEG)
 
 
 def overlap_from_pose_distance(distance: FloatArray, min_overlap: float = MIN_OVERLAP) -> FloatArray:
@@ -122,7 +110,7 @@ def _compare_views(
     stack = ViewStack(grids, poses) if poses else None
 
     def overlap_with(index: int, floor: FloatArray) -> FloatArray:
-        by_pose = overlap_from_pose_distance(pose_distances(stacked, index))
+        by_pose = overlap_from_pose_distance(pose_distances(stacked[index], stacked))
         if stack is None or not stack.known[index]:
             return by_pose
         return np.where(stack.known, stack.overlap_with(index, floor), by_pose)

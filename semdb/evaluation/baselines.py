@@ -12,27 +12,17 @@ import numpy.typing as npt
 import poselib
 
 from semdb.errors import FrameError, UsageError
-from semdb.geometry import back_project, pixels_to_normalized, pose_from, rotation_angle_deg, transform_points
+from semdb.geometry import back_project, pixels_to_normalized, pose_distances, pose_from, transform_points
 from semdb.types import Camera, Candidate, Float32Array, FloatArray, Frame, ImageArray, Localization, ModelInfo, Verdict
 
 STAGE_TRUE_POSE = "true-pose"
 
-TRANSLATION_UNIT_M = 0.3
-ROTATION_UNIT_DEG = 15.0
 NEIGHBOURS = 5
 SIFT_KEYPOINTS = 1500
 RATIO = 0.85
 MIN_INLIERS = 12
 MAX_REPROJECTION_ERROR_PX = 3.0
 MAX_DEPTH_STEP = 0.05  # of the depth: a larger spread around a keypoint is the edge of something
-
-
-def pose_distances(pose: FloatArray, poses: FloatArray) -> FloatArray:
-    """Distance ``[n]`` of `pose` ``[4, 4]`` to `poses` ``[n, 4, 4]``: metres / 0.3 plus degrees / 15."""
-    metres = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1)
-    degrees = np.array([rotation_angle_deg(other[:3, :3].T @ pose[:3, :3]) for other in poses])
-    distances: FloatArray = metres / TRANSLATION_UNIT_M + degrees / ROTATION_UNIT_DEG
-    return distances
 
 
 def nearest_in_pose(pose: FloatArray, poses: FloatArray, count: int = NEIGHBOURS) -> list[int]:

@@ -10,16 +10,16 @@ import numpy as np
 
 from semdb.database.planning import check_models
 from semdb.errors import NotFoundError
-from semdb.geometry import pose_error
+from semdb.geometry import pose_distances
 from semdb.localization.coarse import Batch, CoarseOptions, CoarseSource, Proposal, Stage, cascade
 from semdb.localization.keyframe_cache import KeyframeCache
 from semdb.localization.matching import Matches
 from semdb.localization.pose import PoseEstimate, PoseOptions, estimate_pose, match_view, rival_pose
 from semdb.localization.verdict import Judgement, VerdictOptions, convinces, judge
 from semdb.localization.views import KeyframeView, View, make_view
-from semdb.types import Candidate, Description, Float32Array, FloatArray, Localization, ModelInfo, Verdict
+from semdb.types import Candidate, Description, Float32Array, Localization, ModelInfo, Verdict
 
-FAR = 4.0  # 0.3 m and 15 degrees count as 1: keyframes nearer than this may see the same things
+FAR = 4.0  # of `pose_distances`: keyframes nearer than this may see the same things
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,10 +144,8 @@ class Localizer:
             return
         matched = {keyframe.keyframe_id for keyframe in search.keyframes}
         ids, poses = self.cache.poses()
-        distance = [
-            np.inf if i in matched else _pose_distance(search.estimate.world_from_camera, pose)
-            for i, pose in zip(ids, poses, strict=True)
-        ]
+        distance = pose_distances(search.estimate.world_from_camera, poses)
+        distance[[n for n, keyframe_id in enumerate(ids) if keyframe_id in matched]] = np.inf
         nearest = [int(n) for n in np.argsort(distance, kind="stable")[: self.options.neighbours]]
         chosen = [ids[n] for n in nearest if distance[n] < FAR]
         if not chosen:
@@ -170,15 +168,14 @@ class Localizer:
             return
         limit = max(known) - self.options.twin_cosine
         ids, poses = self.cache.poses()
-        position = {keyframe_id: n for n, keyframe_id in enumerate(ids)}
+        distance = dict(zip(ids, pose_distances(search.estimate.world_from_camera, poses), strict=True))
         matched = {keyframe.keyframe_id for keyframe in search.keyframes}
         chosen = [
             proposal
             for proposal in search.following
             if proposal.cosine >= limit
             and proposal.keyframe_id not in matched
-            and proposal.keyframe_id in position
-            and _pose_distance(search.estimate.world_from_camera, poses[position[proposal.keyframe_id]]) >= FAR
+            and distance.get(proposal.keyframe_id, 0.0) >= FAR
         ][: self.options.twins]
         if chosen:
             search.proposals += chosen
@@ -255,12 +252,6 @@ class _TimedSource:
 
 def _class_counts(description: Description) -> dict[str, float]:
     return {name: float(count) for name, count in description.category_counts.items()}
-
-
-def _pose_distance(first: FloatArray, second: FloatArray) -> float:
-    """Unitless: 0.3 m and 15 degrees count alike."""
-    distance, angle = pose_error(first, second)
-    return distance / 0.3 + angle / 15
 
 
 def _best_pairs(

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from semdb.errors import RecordingError, UsageError
-from semdb.geometry import pose_error, pose_from, so3_exp
-from semdb.keyframes import farthest_views, overlap_from_pose_distance, pose_distances, select_keyframes
+from semdb.geometry import pose_distances, pose_error, pose_from, so3_exp
+from semdb.keyframes import farthest_views, overlap_from_pose_distance, select_keyframes
 from semdb.recordings import open_recording
 from semdb.types import Camera, Float32Array, FloatArray
 from semdb.view_overlap import ViewStack, view_grid, view_overlap
@@ -87,7 +87,7 @@ def test_pose_distances_match_pose_error() -> None:
     for pose in poses:
         metres, degrees = pose_error(pose, poses[1])
         expected.append(metres / 0.3 + degrees / 15)
-    np.testing.assert_allclose(pose_distances(poses, 1), expected, atol=1e-9)
+    np.testing.assert_allclose(pose_distances(poses[1], poses), expected, atol=1e-9)
     assert overlap_from_pose_distance(np.array([0.0, 1.0, 2.0]), 0.5).tolist() == [1.0, 0.5, 0.25]
 
 
@@ -143,7 +143,7 @@ def test_without_depth_poses_decide(tmp_path: Path) -> None:
     assert [entry.index for entry in select_keyframes(recording, count=3)] in ([0, 5, 11], [0, 6, 11])
     chosen = select_keyframes(recording)  # neighbours are 0.62 apart (0.06 m and 5.9 degrees)
     poses = np.stack([entry.world_from_camera for entry in recording.entries if entry.world_from_camera is not None])
-    nearest = np.min([pose_distances(poses, entry.index) for entry in chosen], axis=0)
+    nearest = np.min([pose_distances(poses[entry.index], poses) for entry in chosen], axis=0)
     assert nearest.max() <= 1.0
     assert 4 <= len(chosen) < 12
 

@@ -16,11 +16,10 @@ from semdb.evaluation.baselines import (
     estimate_pose,
     nearest_in_pose,
     points_at,
-    pose_distances,
     ratio_matches,
 )
 from semdb.evaluation.protocols import evenly_spaced, split_paper
-from semdb.geometry import invert_pose, pose_error, pose_from, project, so3_exp, transform_points
+from semdb.geometry import invert_pose, pose_distances, pose_error, pose_from, project, so3_exp, transform_points
 from semdb.types import Camera, FloatArray, Frame, Verdict
 
 CAMERA = Camera(320, 240, 260.0, 262.0, 159.5, 119.5)
