@@ -160,7 +160,7 @@ class Localizer:
     def _ask_twins(self, search: _Search) -> None:
         """A keyframe far from the pose that looks as much like the query may show a place that is the same twice.
 
-        Its pairs do not join the pose; they are there for `rival_pose`. On the recordings of docs/localization.md the
+        Its pairs do not join the pose; they are there for `rival_pose`. On the recordings of README.md the
         best far keyframe is 0.07 or more behind in cosine for 99 of 100 queries, so hardly any query pays for this.
         """
         known = [proposal.cosine for proposal in search.proposals if np.isfinite(proposal.cosine)]

@@ -15,7 +15,7 @@ class VerdictOptions:
     """A pose is `localized` when every bound holds, `ambiguous` when only those named so do, `failed` otherwise.
 
     The support of the first matching is enough when it is many pairs, or fewer that are a good share of those tried.
-    Of 700 pairs of images of the recordings in docs/localization.md, 250 without a right answer, the bounds let 3
+    Of 700 pairs of images of the recordings in README.md, 250 without a right answer, the bounds let 3
     wrong poses pass (all of them less than twice as far off as the limit of a false localization) and keep 92 % of the
     right ones; with several keyframes joined hardly a right one is that weak. Images of another room reach up to 50
     guided inliers, but at most 15 first ones, 9 with the best keyframe and an agreement of 0.28.
