@@ -56,7 +56,7 @@ class QueryReader:
         self._known = tuple(known)
         self._say = say or (lambda line: None)
         self._said: set[str] = set()
-        self._recordings: dict[Path, Recording | None] = {}
+        self._recordings: dict[Path, tuple[Recording, dict[Path, FrameEntry]] | None] = {}
 
     def read(self, path: Path, depth_path: Path | None = None) -> QueryImage:
         """The image at `path` with depth from `depth_path`, which must be registered to it and of its size.
@@ -78,7 +78,7 @@ class QueryReader:
         if found is not None:
             recording, entry = found
             pose = entry.world_from_camera
-            instances = recording.read(entry).instances if entry.masks_path is not None else None
+            instances = recording.read_instances(entry)
         return QueryImage(path, image, camera, depth, instances, pose)
 
     def _camera_of(
@@ -117,10 +117,9 @@ class QueryReader:
         for folder in (absolute.parent, absolute.parent.parent):
             if folder not in self._recordings:
                 self._recordings[folder] = _open_or_none(folder)
-            recording = self._recordings[folder]
-            for entry in recording.entries if recording else ():
-                if entry.image_path.resolve() == absolute and recording is not None:
-                    return recording, entry
+            found = self._recordings[folder]
+            if found is not None and absolute in found[1]:
+                return found[0], found[1][absolute]
         return None
 
     def _tell(self, line: str) -> None:
@@ -129,9 +128,12 @@ class QueryReader:
             self._say(line)
 
 
-def _open_or_none(folder: Path) -> Recording | None:
+def _open_or_none(folder: Path) -> tuple[Recording, dict[Path, FrameEntry]] | None:
+    """The one recording in `folder` with its frames by the path of their image; None where there is none."""
     try:
         recordings = open_recordings(folder)
     except RecordingError:
         return None
-    return recordings[0] if len(recordings) == 1 else None
+    if len(recordings) != 1:
+        return None
+    return recordings[0], {entry.image_path.resolve(): entry for entry in recordings[0].entries}

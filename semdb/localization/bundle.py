@@ -18,14 +18,6 @@ from semdb.types import Float32Array, FloatArray, IntArray
 CAUCHY_SQUARED = 4.0  # (2 sigma)^2: where the loss leaves the parabola
 
 
-def depth_sigma(depth: FloatArray) -> FloatArray:
-    """Standard deviation in metres of a structured-light depth of `depth` metres.
-
-    The axial noise that Nguyen, Izadi and Lovell measured (3DIMPVT 2012): 0.0012 + 0.0019 (z - 0.4)^2.
-    """
-    return np.asarray(0.0012 + 0.0019 * (depth - 0.4) ** 2)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class BundleProblem:
     """What was seen. Pixels are divided by the focal length: normalised, undistorted coordinates.

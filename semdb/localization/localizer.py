@@ -39,6 +39,7 @@ class _Search:
     """What one query has tried so far."""
 
     query: View
+    keyframes_in_map: int
     keyframes: list[KeyframeView] = field(default_factory=list)
     matches: list[Matches] = field(default_factory=list)
     proposals: list[Proposal] = field(default_factory=list)
@@ -74,9 +75,9 @@ class Localizer:
 
         Raises ProvenanceError when other models made the map, NotFoundError when the map holds no keyframe.
         """
-        self._check(description)
-        search = _Search(self._view_of(description))
-        source = _TimedSource(self.source)
+        keyframe_ids = self._check(description)
+        search = _Search(self._view_of(description), len(keyframe_ids))
+        source = _OneQuery(self.source, keyframe_ids)
         started = time.perf_counter()
         for batch in cascade(source, _class_counts(description), description.cnn_vector, self.options.coarse):
             search.timing_ms["rank"] += _ms_since(started)
@@ -90,18 +91,20 @@ class Localizer:
 
     def localize_among(self, description: Description, keyframe_ids: Sequence[int]) -> Localization:
         """The fine step alone, on keyframes that the caller names (the `oracle` of evaluations)."""
-        self._check(description)
-        search = _Search(self._view_of(description))
+        search = _Search(self._view_of(description), len(self._check(description)))
         proposals = tuple(Proposal(i, float("nan"), float("nan")) for i in keyframe_ids)
         self._try(search, Batch(Stage.GIVEN, proposals, 0))
         return self._conclude(search)
 
-    def _check(self, description: Description) -> None:
+    def _check(self, description: Description) -> Sequence[int]:
+        """The keyframes of the map, once it is known that they can be compared with `description`."""
         if self.source.refresh():
             self.cache.forget()
-        if not self.source.keyframe_ids():
+        keyframe_ids = self.source.keyframe_ids()
+        if not keyframe_ids:
             raise NotFoundError(f"map {self.map_name!r} holds no keyframe: ingest a recording into it first")
         check_models(self.models, description.models, f"the map {self.map_name!r}")
+        return keyframe_ids
 
     def _view_of(self, description: Description) -> View:
         categories = [detection.category for detection in description.detections]
@@ -198,7 +201,7 @@ class Localizer:
             inliers=0 if search.estimate is None else search.estimate.inliers,
             stage=search.stage,
             candidates=self._candidates(search, inliers),
-            ranked_share=search.ranked / max(len(self.source.keyframe_ids()), 1),
+            ranked_share=search.ranked / search.keyframes_in_map,
             keyframes_matched=len(search.keyframes),
             reason=judgement.reason,
             timing_ms=search.timing_ms,
@@ -221,18 +224,19 @@ class Localizer:
         )
 
 
-class _TimedSource:
-    """A source that adds up how long its class filter takes."""
+class _OneQuery:
+    """A source for one query: the keyframes of the map are known, and the time of the class filter is added up."""
 
-    def __init__(self, source: CoarseSource) -> None:
+    def __init__(self, source: CoarseSource, keyframe_ids: Sequence[int]) -> None:
         self._source = source
+        self._keyframe_ids = keyframe_ids
         self.filter_ms = 0.0
 
     def refresh(self) -> bool:
         return self._source.refresh()
 
     def keyframe_ids(self) -> Sequence[int]:
-        return self._source.keyframe_ids()
+        return self._keyframe_ids
 
     def class_scores(self, counts: Mapping[str, float]) -> dict[int, float]:
         started = time.perf_counter()

@@ -103,7 +103,7 @@ class Recording:
             depth=None if depth_bytes is None else self._decode_depth(depth_bytes, entry),
             camera=self.camera,
             world_from_camera=entry.world_from_camera,
-            instances=self._read_instances(entry),
+            instances=self.read_instances(entry),
             image_bytes=image_bytes,
             depth_bytes=depth_bytes,
             depth_scale=None if depth_bytes is None else self.depth_scale,
@@ -119,6 +119,18 @@ class Recording:
         if entry.depth_path is None:
             return None
         return self._decode_depth(read_bytes(entry.depth_path), entry)
+
+    def read_instances(self, entry: FrameEntry) -> InstanceMasks | None:
+        """Only the object masks; None where there are none. Raises FrameError that names the file."""
+        if entry.masks_path is None or self.categories is None:
+            return None
+        name = str(entry.masks_path)
+        size = (self.camera.width, self.camera.height)
+        labels = decode_16bit(read_bytes(entry.masks_path), name, size, "an image of masks")
+        unknown = sorted(set(np.unique(labels).tolist()) - {0} - set(self.categories))
+        if unknown:
+            raise FrameError(f"{name}: label {unknown[0]} is not in masks/classes.json")
+        return InstanceMasks(labels, self.categories)
 
     def frames(self) -> Iterator[Frame]:
         """All usable frames, decoded one by one; what cannot be decoded goes to `decode_failures`."""
@@ -147,14 +159,3 @@ class Recording:
         size = depth_size(self.camera, self.depth_registration)
         depth = decode_depth(data, str(entry.depth_path), self.depth_scale, size)
         return register_depth(depth, self.depth_registration, self.camera)
-
-    def _read_instances(self, entry: FrameEntry) -> InstanceMasks | None:
-        if entry.masks_path is None or self.categories is None:
-            return None
-        name = str(entry.masks_path)
-        size = (self.camera.width, self.camera.height)
-        labels = decode_16bit(read_bytes(entry.masks_path), name, size, "an image of masks")
-        unknown = sorted(set(np.unique(labels).tolist()) - {0} - set(self.categories))
-        if unknown:
-            raise FrameError(f"{name}: label {unknown[0]} is not in masks/classes.json")
-        return InstanceMasks(labels, self.categories)

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from semdb.geometry import invert_pose, pose_error, so3_exp
-from semdb.localization.bundle import BundleProblem, _linearise, _move, adjust, depth_sigma
+from semdb.localization.bundle import BundleProblem, _linearise, _move, adjust
+from semdb.localization.bundle_kernels import depth_sigma
 from semdb.localization.matching import Evidence, MatchingOptions
 from semdb.localization.pose import PoseOptions, estimate_pose, match_view, rival_pose
 from semdb.localization.views import ClassNumbers, make_keyframe_view
