@@ -108,7 +108,7 @@ def _evaluate_recording(
         runs = [_open_run(method, recording, keyframes, describers, store, options, progress) for method in methods]
         answers: list[list[QueryResult]] = [[] for _ in runs]
         for done, frame in enumerate(_read(recording, queries), start=1):
-            described: dict[Describer, tuple[Description, float]] = {}
+            described: dict[int, tuple[Description, float]] = {}
             for run, found in zip(runs, answers, strict=True):
                 found.append(run.answer(frame[0], frame[1], described))
             if progress is not None:
@@ -158,9 +158,7 @@ class _Run:
         self.models = models
         self.keyframes = keyframes
 
-    def answer(
-        self, frame: Frame, decode_ms: float, described: dict[Describer, tuple[Description, float]]
-    ) -> QueryResult:
+    def answer(self, frame: Frame, decode_ms: float, described: dict[int, tuple[Description, float]]) -> QueryResult:
         """The result for one frame. `described` shares descriptions between the methods of one query."""
         localization, timing = self.localize(frame, described)
         timing = {"decode": decode_ms, **timing, **localization.timing_ms}
@@ -168,7 +166,7 @@ class _Run:
         return query_result(frame.name, frame.index, localization, frame.world_from_camera, timing_ms=timing)
 
     def localize(
-        self, frame: Frame, described: dict[Describer, tuple[Description, float]]
+        self, frame: Frame, described: dict[int, tuple[Description, float]]
     ) -> tuple[Localization, dict[str, float]]:
         """The answer, and wall times; `describe` and `localize` among them, which are whole."""
         raise TypeError(f"{type(self).__name__} answers nothing")
@@ -182,18 +180,19 @@ class _LocalizerRun(_Run):
         self._query_depth = query_depth
 
     def describe(
-        self, frame: Frame, described: dict[Describer, tuple[Description, float]]
+        self, frame: Frame, described: dict[int, tuple[Description, float]]
     ) -> tuple[Description, dict[str, float]]:
-        if self._describer not in described:
+        key = id(self._describer)
+        if key not in described:
             started = time.perf_counter()
             depth = frame.depth if self._query_depth else None
             description = self._describer.describe(frame.image, depth, frame.camera, frame.instances)
-            described[self._describer] = description, (time.perf_counter() - started) * 1000
-        description, milliseconds = described[self._describer]
+            described[key] = description, (time.perf_counter() - started) * 1000
+        description, milliseconds = described[key]
         return description, {"describe": milliseconds, **description.timing_ms}
 
     def localize(
-        self, frame: Frame, described: dict[Describer, tuple[Description, float]]
+        self, frame: Frame, described: dict[int, tuple[Description, float]]
     ) -> tuple[Localization, dict[str, float]]:
         description, timing = self.describe(frame, described)
         started = time.perf_counter()
@@ -205,7 +204,7 @@ class _OracleRun(_LocalizerRun):
     """Told the true pose, to choose keyframes by."""
 
     def localize(
-        self, frame: Frame, described: dict[Describer, tuple[Description, float]]
+        self, frame: Frame, described: dict[int, tuple[Description, float]]
     ) -> tuple[Localization, dict[str, float]]:
         if frame.world_from_camera is None:
             raise FrameError(f"{frame.name}: oracle chooses keyframes by the true pose, and there is none")
@@ -223,7 +222,7 @@ class _SiftRun(_Run):
         self._reference = reference
 
     def localize(
-        self, frame: Frame, described: dict[Describer, tuple[Description, float]]
+        self, frame: Frame, described: dict[int, tuple[Description, float]]
     ) -> tuple[Localization, dict[str, float]]:
         found = self._reference.localize(frame)
         features = found.timing_ms["features"]
