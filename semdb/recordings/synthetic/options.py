@@ -20,6 +20,8 @@ class SyntheticOptions:
     change. `lap_frames` is the number of frames in which the camera turns once around itself.
     `blur` is the share of the time between two frames during which the shutter is open. `lighting` scales a change
     of gain, colour and direction of the light (1 is strong). `second_visit` walks another way, some objects moved.
+    Rooms to be confused with others: `furniture_seed` puts the furniture of another seed into the room, `alike` mirrors
+    every texture (same shapes, same colours, another room), `desks` furnishes it with so many equal workplaces.
     """
 
     frames: int = 120
@@ -32,6 +34,9 @@ class SyntheticOptions:
     lighting: float = 0.0
     second_visit: bool = False
     lap_frames: int = 120
+    furniture_seed: int | None = None
+    alike: bool = False
+    desks: int = 0
 
     def __post_init__(self) -> None:
         """Raises UsageError naming the option that makes no sense."""
@@ -44,10 +49,12 @@ class SyntheticOptions:
             ("blur", 0.0, 1.0),
             ("lighting", 0.0, 1.0),
             ("lap_frames", 8, 1_000_000),
+            ("furniture_seed", 0, 2**32 - 1),
+            ("desks", 0, 8),
         )
         for name, low, high in limits:
             value = getattr(self, name)
-            if not low <= value <= high:
+            if value is not None and not low <= value <= high:
                 raise UsageError(f"synthetic recording: {name} = {value} is outside {low:g} to {high:g}")
 
     @property

@@ -70,8 +70,12 @@ def _disc_overlaps(rect: Rect, centre: tuple[float, float], radius: float) -> bo
     return bool(np.hypot(dx, dy) < radius)
 
 
-def build_room(room_seed: int) -> Room:
-    """The room of a seed, as a first visit finds it."""
+def build_room(room_seed: int, furniture_seed: int | None = None, desks: int = 0) -> Room:
+    """The room of a seed, as a first visit finds it.
+
+    With `furniture_seed` its furniture and pictures are those of another seed, with `desks` it has so many equal
+    workplaces (as far as there is place) and no other furniture.
+    """
     rng = np.random.default_rng([room_seed, 1])
     palette = Palette(rng)
     width, depth, height = rng.uniform(5.4, 6.6), rng.uniform(4.9, 5.9), rng.uniform(2.5, 2.8)
@@ -79,6 +83,12 @@ def build_room(room_seed: int) -> Room:
     room = Room((float(width), float(depth), float(height)), (float(-0.55 * corner[0]), float(-0.4 * corner[1])))
     _shell(room, palette, rng)
     _door_and_windows(room, palette, rng)
+    if furniture_seed is not None:
+        rng = np.random.default_rng([furniture_seed, 6])
+        palette = Palette(rng)
+    if desks:
+        _equal_desks(room, palette, rng, desks)
+        return room
     _dining(room, palette, rng, corner)
     chosen = [f for f in _FURNITURE if rng.random() < f.chance]
     for kind in chosen:
@@ -341,6 +351,20 @@ def _desk(room: Room, p: Palette, rng: Rng, pose: FloatArray, width: float) -> N
     scatter(room, p, rng, spot, [str(c) for c in rng.permutation(wanted)[:4]])
     place = pose @ yaw_pose(float(rng.uniform(-0.2, 0.2)), 0.86, 0, np.pi + float(rng.uniform(-0.5, 0.5)))
     room.add("chair", furniture.chair(p, wood, p.pick(p.cloth)), place, 0.3)
+
+
+def _equal_desks(room: Room, p: Palette, rng: Rng, count: int) -> None:
+    """Up to `count` workplaces that are alike to the last book: each is the first one, put elsewhere."""
+    width = 1.4
+    model = Room(room.size, room.clear)
+    _desk(model, p, rng, np.eye(4), width)
+
+    def put(target: Room, p: Palette, rng: Rng, pose: FloatArray, width: float) -> None:
+        for item in model.items:
+            target.add(item.category, item.prims, pose @ item.pose, item.radius)
+
+    for _ in range(count):
+        _place(room, p, rng, Kind(put, (width, width), 1.1, 0.75, 1.0))
 
 
 def _counter(room: Room, p: Palette, rng: Rng, pose: FloatArray, width: float) -> None:

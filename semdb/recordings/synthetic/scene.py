@@ -69,6 +69,25 @@ class Item:
     at: tuple[float, float] = (0.0, 0.0)
 
 
+def mirrored(items: Sequence[Item]) -> list[Item]:
+    """`items` with every texture mirrored: the same shapes in the same colours, and yet nothing is the same."""
+    known: dict[int, Texture] = {}
+
+    def turn(texture: Texture) -> Texture:
+        if id(texture) not in known:
+            known[id(texture)] = replace(texture, image=np.ascontiguousarray(texture.image[:, ::-1]))
+        return known[id(texture)]
+
+    def look(material: Material) -> Material:
+        upright = None if material.upright is None else turn(material.upright)
+        return replace(material, texture=turn(material.texture), upright=upright)
+
+    return [
+        replace(item, prims=[replace(prim, faces=tuple(look(face) for face in prim.faces)) for prim in item.prims])
+        for item in items
+    ]
+
+
 @dataclass(slots=True, eq=False)
 class Spot:
     """A horizontal rectangle to put things on: `pose` of its centre, half sizes in metres."""

@@ -23,7 +23,7 @@ from semdb.recordings.synthetic import sensor
 from semdb.recordings.synthetic.options import DEPTH_SCALE, FRAME_RATE_HZ, SyntheticOptions
 from semdb.recordings.synthetic.render import Lamp, bake_light, render_view
 from semdb.recordings.synthetic.room import Room, build_room
-from semdb.recordings.synthetic.scene import PackedScene, pack, yaw_pose
+from semdb.recordings.synthetic.scene import PackedScene, mirrored, pack, yaw_pose
 from semdb.recordings.synthetic.trajectory import walk
 from semdb.recordings.synthetic.visit import move_objects
 from semdb.types import Float32Array, FloatArray, ImageArray
@@ -45,13 +45,16 @@ _first_visit = lru_cache(maxsize=2)(build_room)
 
 
 @lru_cache(maxsize=2)
-def _scene(room_seed: int, visit_seed: int | None) -> tuple[Room, PackedScene, tuple[int, ...]]:
+def _scene(
+    room_seed: int, furniture_seed: int | None, desks: int, alike: bool, visit_seed: int | None
+) -> tuple[Room, PackedScene, tuple[int, ...]]:
     """The lit room of a first (`visit_seed` None) or second visit, and the labels of what was moved."""
-    room, moved = _first_visit(room_seed), list[int]()
+    room, moved = _first_visit(room_seed, furniture_seed, desks), list[int]()
     if visit_seed is not None:
         room = copy.deepcopy(room)
         moved = move_objects(room, visit_seed, room_seed)
-    return room, bake_light(pack(room.items), _lamps(room)), tuple(moved)
+    items = mirrored(room.items) if alike else room.items
+    return room, bake_light(pack(items), _lamps(room)), tuple(moved)
 
 
 def _lamps(room: Room) -> list[Lamp]:
@@ -71,7 +74,9 @@ class SyntheticSequence:
         self.options = options
         self.camera = options.camera
         visit = options.seed if options.second_visit else None
-        self.room, self._packed, self.moved = _scene(options.room_seed, visit)
+        self.room, self._packed, self.moved = _scene(
+            options.room_seed, options.furniture_seed, options.desks, options.alike, visit
+        )
         # one more pose than frames: the blur of the last frame needs where the camera goes next
         poses = walk(self.room, options.frames + 1, options.lap_frames, options.seed, options.second_visit)
         self._poses = poses
