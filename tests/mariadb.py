@@ -18,7 +18,7 @@ import socket
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -93,6 +93,16 @@ def server() -> Iterator[TestServer]:
         url = make_url(named)
         yield TestServer(url.set(database=None), url.database or "semdb_test")
         return
+    with private_server() as started:
+        yield started
+
+
+@contextlib.contextmanager
+def private_server(keep: Path | None = None, options: Sequence[str] = ()) -> Iterator[TestServer]:
+    """A server that is started here and stopped in the end, with `options` of mariadbd beside the tests' own.
+
+    With `keep` its data stay in that folder, which is used again when it holds some; else they go with the server.
+    """
     programs = {name: shutil.which(name, path=os.environ.get("PATH", "") + ":/usr/sbin") for name in _PROGRAMS}
     missing = [name for name, path in programs.items() if path is None]
     if missing:
@@ -100,54 +110,47 @@ def server() -> Iterator[TestServer]:
             f"no {' and no '.join(missing)} here: install mariadb-server (apt-get install mariadb-server), or set "
             "SEMDB_TEST_MYSQL_URL=mysql+pymysql://USER:PASSWORD@HOST/semdb_test"
         )
+    if keep is not None:
+        keep.mkdir(parents=True, exist_ok=True)
     # Not below pytest's own folder, which is closed to the server's user.
-    folder = Path(tempfile.mkdtemp(prefix="semdb-mariadb-", dir=_parent()))
+    folder = keep or Path(tempfile.mkdtemp(prefix="semdb-mariadb-", dir=_parent()))
     try:
-        with _started(folder, str(programs["mariadbd"]), str(programs["mariadb-install-db"])) as started:
+        paths = (str(programs["mariadbd"]), str(programs["mariadb-install-db"]))
+        with _started(folder, *paths, options=options, kept=keep is not None) as started:
             yield started
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        if keep is None:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 _PROGRAMS = ("mariadbd", "mariadb-install-db")
 
 
 @contextlib.contextmanager
-def _started(folder: Path, mariadbd: str, install: str) -> Iterator[TestServer]:
+def _started(folder: Path, mariadbd: str, install: str, *, options: Sequence[str], kept: bool) -> Iterator[TestServer]:
     password, port = secrets.token_hex(12), _free_port()
     account = "'semdb_test'@'127.0.0.1'"
+    # The account is made anew: the data may be those of an earlier run.
     (folder / "init.sql").write_text(
-        f"CREATE USER {account} IDENTIFIED BY '{password}';\nGRANT ALL ON *.* TO {account} WITH GRANT OPTION;\n"
+        f"CREATE OR REPLACE USER {account} IDENTIFIED BY '{password}';\n"
+        f"GRANT ALL ON *.* TO {account} WITH GRANT OPTION;\n"
     )
-    (folder / "data").mkdir()
+    empty = not (folder / "data").exists()
+    (folder / "data").mkdir(exist_ok=True)
     # Servers delete temporary tables that they find at their start: in a shared folder, those of others too.
-    (folder / "tmp").mkdir()
+    (folder / "tmp").mkdir(exist_ok=True)
     user = _server_user()
     if user is not None:
         for path in (folder, folder / "init.sql", folder / "data", folder / "tmp"):
             shutil.chown(path, user, user)
     folder.chmod(0o755)
-    as_user = [f"--user={user}"] if user else []
-    made = subprocess.run(
-        [
-            install,
-            "--no-defaults",
-            f"--datadir={folder / 'data'}",
-            f"--tmpdir={folder / 'tmp'}",
-            "--skip-test-db",
-            *as_user,
-        ],
-        capture_output=True,
-        text=True,
-        timeout=START_TIMEOUT_S,
-        check=False,
-    )
-    if made.returncode != 0:
-        raise MariaDBError(f"mariadb-install-db failed: {(made.stdout + made.stderr)[-500:]}")
+    if empty:
+        _install(folder, install, user)
     process = subprocess.Popen(
         [
             mariadbd,
             *SETTINGS,
+            *options,
             f"--datadir={folder / 'data'}",
             f"--tmpdir={folder / 'tmp'}",
             f"--socket={folder / 'socket'}",
@@ -168,8 +171,31 @@ def _started(folder: Path, mariadbd: str, install: str) -> Iterator[TestServer]:
         _wait(process, url, folder / "error.log")
         yield TestServer(url, "semdb_test")
     finally:
-        process.kill()  # nothing in it is worth a clean shutdown
+        if kept:
+            process.terminate()
+        else:
+            process.kill()  # nothing in it is worth a clean shutdown
         process.wait()
+
+
+def _install(folder: Path, install: str, user: str | None) -> None:
+    as_user = [f"--user={user}"] if user else []
+    made = subprocess.run(
+        [
+            install,
+            "--no-defaults",
+            f"--datadir={folder / 'data'}",
+            f"--tmpdir={folder / 'tmp'}",
+            "--skip-test-db",
+            *as_user,
+        ],
+        capture_output=True,
+        text=True,
+        timeout=START_TIMEOUT_S,
+        check=False,
+    )
+    if made.returncode != 0:
+        raise MariaDBError(f"mariadb-install-db failed: {(made.stdout + made.stderr)[-500:]}")
 
 
 def _parent() -> str:
