@@ -1,65 +1,41 @@
-"""The class-attribute filter: which keyframes show the same kinds of objects as the query.
+"""The class-attribute filter in SQL: which keyframes show the same kinds of objects as the query.
 
-Score of a keyframe: sum over the classes of the query of ``idf(c) * min(n_query(c), n_keyframe(c))``, divided by the
-same sum with ``n_query`` alone, so 1 means that everything in the query is there. ``idf(c) = ln((1 + N) / (1 +
-df(c))) + 1`` (N keyframes in the map, df of them show c), which is positive and defined for a class no keyframe shows.
-
-The weights are rounded to integers of a millionth, and so are weight times ``n_query``: sums of integers do not depend
-on the order in which a server adds, so every server, and a mirror in memory, gives the same scores to the last bit.
+The score is that of `semdb.class_score`. What is here is the reference that an index in memory is compared with.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
 
-from sqlalchemy import Connection, Engine, Integer, case, func, literal, select
+from sqlalchemy import Connection, Engine, Integer, Select, case, func, literal, select
 from sqlalchemy.sql.elements import ColumnElement
 
+from semdb.class_score import ClassQuery, ClassTerm, class_query
 from semdb.database import retry
 from semdb.database.records import ScoredKeyframe
 from semdb.database.tables import categories, keyframe_categories, keyframes, recordings
-from semdb.errors import UsageError
 
-SCALE = 1_000_000
-
-
-@dataclass(frozen=True, slots=True)
-class ClassWeight:
-    """What a class of the query counts: `per_object` in a keyframe, at most `full` (integers, millionths)."""
-
-    category_id: int | None  # None: no keyframe of the database ever showed it
-    wanted: float  # objects in the query
-    per_object: int
-    full: int
+CHUNK = 500
 
 
-def class_weight(category_id: int | None, wanted: float, keyframes_total: int, document_frequency: int) -> ClassWeight:
-    """The weight of one class by the formula above."""
-    idf = math.log((1 + keyframes_total) / (1 + document_frequency)) + 1
-    return ClassWeight(category_id, wanted, round(SCALE * idf), round(SCALE * idf * wanted))
+def keyframe_count(engine: Engine, map_id: int) -> int:
+    """How many keyframes a map holds."""
+    return retry.read(engine, lambda connection: _keyframe_count(connection, map_id))
 
 
-def class_weights(engine: Engine, map_id: int, counts: Mapping[str, float]) -> list[ClassWeight]:
-    """The weights of the classes of a query (name -> number of objects, which may be fractional) in a map."""
-    wanted = _positive(counts)
-    return retry.read(engine, lambda connection: _weights(connection, map_id, wanted))
+def _keyframe_count(connection: Connection, map_id: int) -> int:
+    query = select(func.count()).select_from(keyframes.join(recordings)).where(recordings.c.map_id == map_id)
+    return int(connection.execute(query).scalar_one())
 
 
-def _positive(counts: Mapping[str, float]) -> dict[str, float]:
-    for name, count in counts.items():
-        if not math.isfinite(count) or count < 0:
-            raise UsageError(f"the count of the class {name!r} is {count}: a finite number of objects is needed")
-    return {name: count for name, count in counts.items() if count > 0}
+def document_frequencies(engine: Engine, map_id: int, names: Collection[str]) -> dict[str, int]:
+    """How many keyframes of a map show a class; a class that no keyframe of the database shows is left out."""
+    return retry.read(engine, lambda connection: _frequencies(connection, map_id, names))
 
 
-def _weights(connection: Connection, map_id: int, counts: Mapping[str, float]) -> list[ClassWeight]:
-    if not counts:
-        return []
-    total = connection.execute(
-        select(func.count()).select_from(keyframes.join(recordings)).where(recordings.c.map_id == map_id)
-    ).scalar_one()
+def _frequencies(connection: Connection, map_id: int, names: Collection[str]) -> dict[str, int]:
+    if not names:
+        return {}
     frequency = (
         select(func.count())
         .where(
@@ -68,53 +44,85 @@ def _weights(connection: Connection, map_id: int, counts: Mapping[str, float]) -
         )
         .scalar_subquery()
     )
-    query = select(categories.c.name, categories.c.id, frequency).where(categories.c.name.in_(list(counts)))
-    known = {name: (category_id, df) for name, category_id, df in connection.execute(query)}
-    weights: list[ClassWeight] = []
-    for name in sorted(counts):
-        category_id, df = known.get(name, (None, 0))
-        weights.append(class_weight(category_id, counts[name], total, df))
-    return weights
+    query = select(categories.c.name, frequency).where(categories.c.name.in_(sorted(names)))
+    return {name: int(df) for name, df in connection.execute(query)}
 
 
-def class_filter(
-    engine: Engine, map_id: int, counts: Mapping[str, float], minimum_share: float
-) -> list[ScoredKeyframe]:
-    """Keyframes of a map with a class score of at least `minimum_share`, best first, then by id.
+def query_for(engine: Engine, map_id: int, counts: Mapping[str, float]) -> ClassQuery:
+    """The class query for objects per class in a map. Raises UsageError for an impossible count."""
 
-    Keyframes that share no class with the query are never among them. One statement does the filter; a cheap one
-    before it finds how rare the classes are.
-    """
-    wanted = _positive(counts)
-
-    def work(connection: Connection) -> list[ScoredKeyframe]:
-        weights = _weights(connection, map_id, wanted)
-        total = sum(weight.full for weight in weights)
-        known = [weight for weight in weights if weight.category_id is not None]
-        if not known or total == 0:
-            return []
-        c = keyframe_categories.c
-        overlap = func.sum(_contribution(known))
-        query = (
-            select(c.keyframe_id, overlap)
-            .where(c.map_id == map_id, c.category_id.in_([weight.category_id for weight in known]))
-            .group_by(c.keyframe_id)
-            .having(overlap >= max(1, math.ceil(minimum_share * total - 1e-6)))
-            .order_by(overlap.desc(), c.keyframe_id)
-        )
-        # The quotient is taken here: servers divide integers each in their own way.
-        return [ScoredKeyframe(key, int(shared) / total) for key, shared in connection.execute(query)]
+    def work(connection: Connection) -> ClassQuery:
+        total = _keyframe_count(connection, map_id)
+        return class_query(counts, total, _frequencies(connection, map_id, counts))
 
     return retry.read(engine, work)
 
 
-def _contribution(weights: list[ClassWeight]) -> ColumnElement[int]:
-    """What one row (category, keyframe, count) adds: min(n_query, n_keyframe) times the weight of its class."""
+def class_filter(
+    engine: Engine, map_id: int, query: ClassQuery, minimum_share: float, at_most: int | None = None
+) -> list[ScoredKeyframe]:
+    """Keyframes of a map with a class score of at least `minimum_share`: the best `at_most` of them (None: all).
+
+    Best first, equal ones by id. Keyframes that share no class with the query are never among them.
+    """
+
+    def work(connection: Connection) -> list[ScoredKeyframe]:
+        known = _known(connection, query)
+        if not known:
+            return []
+        statement, overlap = _scores(map_id, known)
+        statement = (
+            statement.having(overlap >= query.least(minimum_share))
+            .order_by(overlap.desc(), keyframe_categories.c.keyframe_id)
+            .limit(at_most)
+        )
+        # The quotient is taken here: servers divide integers each in their own way.
+        return [ScoredKeyframe(row[0], int(row[1]) / query.total) for row in connection.execute(statement)]
+
+    return retry.read(engine, work)
+
+
+def class_scores(engine: Engine, map_id: int, query: ClassQuery, keyframe_ids: Sequence[int]) -> dict[int, float]:
+    """Class scores of these keyframes; those that share no class with the query are left out."""
+    keys = [int(key) for key in keyframe_ids]
+
+    def work(connection: Connection) -> dict[int, float]:
+        known = _known(connection, query)
+        found: dict[int, float] = {}
+        for start in range(0, len(keys) if known else 0, CHUNK):
+            statement, _ = _scores(map_id, known)
+            chunk = statement.where(keyframe_categories.c.keyframe_id.in_(keys[start : start + CHUNK]))
+            found.update((row[0], int(row[1]) / query.total) for row in connection.execute(chunk))
+        return found
+
+    return retry.read(engine, work)
+
+
+def _known(connection: Connection, query: ClassQuery) -> list[tuple[int, ClassTerm]]:
+    """The terms of classes that the database knows, with the ids of these."""
+    if not query.terms:
+        return []
+    terms = {term.category: term for term in query.terms}
+    statement = select(categories.c.id, categories.c.name).where(categories.c.name.in_(list(terms)))
+    return sorted((int(key), terms[name]) for key, name in connection.execute(statement))
+
+
+def _scores(map_id: int, known: list[tuple[int, ClassTerm]]) -> tuple[Select[tuple[int, int]], ColumnElement[int]]:
+    """Keyframe and sum of its terms, grouped by keyframe; and the sum for conditions on it."""
+    c = keyframe_categories.c
+    overlap = func.sum(_contribution(known))
+    ids = [category_id for category_id, _ in known]
+    query = select(c.keyframe_id, overlap).where(c.map_id == map_id, c.category_id.in_(ids)).group_by(c.keyframe_id)
+    return query, overlap
+
+
+def _contribution(known: list[tuple[int, ClassTerm]]) -> ColumnElement[int]:
+    """What one row (category, keyframe, count) adds: ``min(full, per_object * count)``."""
     c = keyframe_categories.c
     branches: list[tuple[ColumnElement[bool], ColumnElement[int]]] = []
-    for weight in weights:
-        full, per_object = literal(weight.full, Integer), literal(weight.per_object, Integer)
-        enough = math.ceil(weight.wanted)
-        branches.append(((c.category_id == weight.category_id) & (c.count >= enough), full))
-        branches.append((c.category_id == weight.category_id, per_object * c.count))
+    for category_id, term in known:
+        full, per_object = literal(term.full, Integer), literal(term.per_object, Integer)
+        enough = -(-term.full // term.per_object)
+        branches.append(((c.category_id == category_id) & (c.count >= enough), full))
+        branches.append((c.category_id == category_id, per_object * c.count))
     return case(*branches, else_=literal(0, Integer))

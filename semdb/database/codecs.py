@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -67,6 +68,31 @@ def decode_array(blob: bytes, where: str, *, magic: bytes = ARRAY_MAGIC) -> npt.
     if zlib.crc32(view[_HEADER.size :], zlib.crc32(view[:_CHECKED])) != checksum:
         raise CodecError(f"{where}: the blob's checksum is wrong; delete the recording and ingest it again")
     return np.frombuffer(blob, dtype=dtype, offset=start).reshape(shape)
+
+
+def decode_vectors(blobs: Sequence[bytes], where: str, keys: npt.NDArray[np.int64]) -> Float32Array:
+    """Vectors float32 ``[n, d]`` of many blobs (``[0, 0]`` for none), each checked as by `decode_array`.
+
+    `where` and the key of a blob name its row. Raises CodecError, also for one of another length than the first.
+    """
+    if not len(blobs):
+        return np.empty((0, 0), np.float32)
+    first = decode_array(blobs[0], f"{where} {keys[0]}")
+    if first.ndim != 1 or first.dtype != np.dtype("<f4"):
+        raise CodecError(f"{where} {keys[0]}: {first.dtype} {first.shape} is not a vector")
+    start = _HEADER.size + 4
+    head, tail, size = blobs[0][:_CHECKED], blobs[0][_HEADER.size : start], len(blobs[0])
+    seed = zlib.crc32(head)
+    for key, blob in zip(keys, blobs, strict=True):
+        if len(blob) != size or blob[:_CHECKED] != head or blob[_HEADER.size : start] != tail:
+            other = decode_array(blob, f"{where} {key}")
+            raise CodecError(f"{where} {key}: {other.dtype} {other.shape} is not a vector as others, {first.shape}")
+        if zlib.crc32(memoryview(blob)[_HEADER.size :], seed) != int.from_bytes(
+            blob[_CHECKED : _HEADER.size], "little"
+        ):
+            decode_array(blob, f"{where} {key}")  # says what is wrong
+    joined = np.frombuffer(b"".join(blobs), np.uint8).reshape(len(blobs), size)
+    return np.ascontiguousarray(joined[:, start:]).view("<f4").astype(np.float32, copy=False)
 
 
 def encode_mask(mask: BoolArray) -> bytes:

@@ -10,14 +10,13 @@ import numpy as np
 from sqlalchemy import Connection, Engine, Select, select
 
 from semdb.database import retry
-from semdb.database.codecs import decode_array, decode_keypoints, decode_mask
-from semdb.database.records import Change, ChangeKind, StoredImage, StoredKeyframe, StoredObject
+from semdb.database.codecs import decode_array, decode_keypoints, decode_mask, decode_vectors
+from semdb.database.records import StoredImage, StoredKeyframe, StoredObject
 from semdb.database.tables import (
     cameras,
     categories,
     cnn_vectors,
     descriptors,
-    keyframe_changes,
     keyframe_images,
     keyframes,
     keypoints,
@@ -25,7 +24,7 @@ from semdb.database.tables import (
     objects,
     recordings,
 )
-from semdb.errors import CodecError, DatabaseError, NotFoundError
+from semdb.errors import CodecError, NotFoundError
 from semdb.geometry import pose_from, rotation_from_quat_wxyz
 from semdb.types import BoolArray, Camera, Float32Array, FloatArray, ObjectGeometry
 
@@ -69,34 +68,29 @@ def load_vectors(engine: Engine, keys: Sequence[int]) -> Float32Array:
 
     blobs = retry.read(engine, work)
     _missing(keys, blobs, "vector of the keyframe")
-    if not keys:
-        return np.empty((0, 0), dtype=np.float32)
-    first = decode_array(blobs[keys[0]], f"cnn_vectors of keyframe {keys[0]}")
-    result = np.empty((len(keys), *first.shape), dtype=np.float32)
-    for row, key in enumerate(keys):
-        vector = decode_array(blobs[key], f"cnn_vectors of keyframe {key}")
-        if vector.shape != first.shape or vector.ndim != 1 or vector.dtype != np.dtype("<f4"):
-            raise CodecError(f"cnn_vectors of keyframe {key}: {vector.dtype} {vector.shape} is not a vector as others")
-        result[row] = vector
-    return result
+    return decode_vectors([blobs[key] for key in keys], "cnn_vectors of keyframe", np.array(keys, np.int64))
 
 
 def _pose(row: Any) -> FloatArray:
     return pose_from(rotation_from_quat_wxyz([row.qw, row.qx, row.qy, row.qz]), [row.tx, row.ty, row.tz])
 
 
-def poses(engine: Engine, map_id: int) -> tuple[list[int], FloatArray]:
-    """Ids (ascending) and poses float64 ``[n, 4, 4]`` of all keyframes of a map."""
+def poses(engine: Engine, map_id: int, keys: Sequence[int] | None = None) -> tuple[list[int], FloatArray]:
+    """Ids (ascending) and poses float64 ``[n, 4, 4]`` of the keyframes of a map.
+
+    With `keys`, of those of them that are in the map.
+    """
     k = keyframes.c
-    query = (
-        select(k.id, k.qw, k.qx, k.qy, k.qz, k.tx, k.ty, k.tz)
-        .join(recordings)
-        .where(recordings.c.map_id == map_id)
-        .order_by(k.id)
-    )
-    rows = retry.read(engine, lambda c: list(c.execute(query)))
-    matrices = np.array([_pose(row) for row in rows], dtype=np.float64).reshape(-1, 4, 4)
-    return [row.id for row in rows], matrices
+    query = select(k.id, k.qw, k.qx, k.qy, k.qz, k.tx, k.ty, k.tz).join(recordings).where(recordings.c.map_id == map_id)
+
+    def work(connection: Connection) -> list[Any]:
+        if keys is None:
+            return list(connection.execute(query))
+        return list(_chunked(connection, _ints(keys), lambda chunk: query.where(k.id.in_(chunk))))
+
+    rows = sorted(map(tuple, retry.read(engine, work)))
+    matrices = np.array([pose_from(rotation_from_quat_wxyz(row[1:5]), row[5:8]) for row in rows], dtype=np.float64)
+    return [row[0] for row in rows], matrices.reshape(-1, 4, 4)
 
 
 def load_keyframes(engine: Engine, keys: Sequence[int], *, with_descriptors: bool = True) -> list[StoredKeyframe]:
@@ -229,19 +223,3 @@ def load_masks(engine: Engine, keyframe_id: int) -> tuple[BoolArray, ...]:
     query = select(objects.c.ordinal, objects.c.mask).where(objects.c.keyframe_id == int(keyframe_id))
     rows = retry.read(engine, lambda c: list(c.execute(query.order_by(objects.c.ordinal))))
     return tuple(decode_mask(blob, f"mask of object {ordinal} of keyframe {keyframe_id}") for ordinal, blob in rows)
-
-
-def changes_since(engine: Engine, map_id: int, change_id: int) -> list[Change]:
-    """Changes of a map with an id above `change_id`, ascending.
-
-    Ids commit out of order: a reader that keeps a mirror asks again from some way back and applies changes twice.
-    """
-    c = keyframe_changes.c
-    query = select(c.id, c.keyframe_id, c.kind).where(c.map_id == map_id, c.id > change_id).order_by(c.id)
-    rows = retry.read(engine, lambda connection: list(connection.execute(query)))
-    try:
-        return [Change(row.id, row.keyframe_id, ChangeKind(row.kind)) for row in rows]
-    except ValueError as error:
-        raise DatabaseError(
-            f"the change log holds a kind that this semdb does not know ({error}): upgrade it"
-        ) from error

@@ -157,6 +157,15 @@ class Change:
 
 
 @dataclass(frozen=True, slots=True)
+class ChangeMark:
+    """The log of changes of a map after some id: a number and two sums that differ when anything was added."""
+
+    newest: int  # 0: nothing there
+    rows: int
+    sum_of_ids: int
+
+
+@dataclass(frozen=True, slots=True)
 class Deleted:
     """What a deletion removed."""
 

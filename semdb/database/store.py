@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
 from sqlalchemy import Engine, select
 
-from semdb.database import class_filter, deletion, lookups, planning, reading, reporting, retry, schema
+from semdb.class_score import ClassQuery
+from semdb.database import (
+    change_log,
+    class_filter,
+    deletion,
+    lookups,
+    planning,
+    reading,
+    reporting,
+    retry,
+    scanning,
+    schema,
+)
 from semdb.database.engine import make_engine, parse_url, safe_url, sqlite_path
 from semdb.database.ids import SharedIds
 from semdb.database.records import (
     Change,
+    ChangeMark,
     Deleted,
     FailedItem,
     KeyframeRecord,
@@ -27,7 +40,7 @@ from semdb.database.records import (
 from semdb.database.tables import maps, recordings
 from semdb.database.writing import KeyframeWriter
 from semdb.errors import NotFoundError, SchemaError
-from semdb.types import BoolArray, Camera, Float32Array, FloatArray, Localization, ModelInfo
+from semdb.types import BoolArray, Camera, Float32Array, FloatArray, Int64Array, Localization, ModelInfo
 
 Progress = Callable[[int, int], None]
 
@@ -141,13 +154,27 @@ class Store:
 
     # reading
 
-    def class_filter(self, map_id: int, counts: Mapping[str, float], minimum_share: float) -> list[ScoredKeyframe]:
-        """Keyframes that show enough of the query's classes, best first: see `semdb.database.class_filter`."""
-        return class_filter.class_filter(self.engine, map_id, counts, minimum_share)
+    def class_query(self, map_id: int, counts: Mapping[str, float]) -> ClassQuery:
+        """The query for objects per class, weighted by how rare the classes are in a map. Raises UsageError."""
+        return class_filter.query_for(self.engine, map_id, counts)
 
-    def class_scores(self, map_id: int, counts: Mapping[str, float]) -> list[ScoredKeyframe]:
-        """All keyframes of a map that share any class with the query, best first."""
-        return class_filter.class_filter(self.engine, map_id, counts, 0.0)
+    def class_filter(
+        self, map_id: int, query: ClassQuery, minimum_share: float, at_most: int | None = None
+    ) -> list[ScoredKeyframe]:
+        """Keyframes that show enough of the query's classes, best first: see `semdb.database.class_filter`."""
+        return class_filter.class_filter(self.engine, map_id, query, minimum_share, at_most)
+
+    def class_scores(self, map_id: int, query: ClassQuery, keyframe_ids: Sequence[int]) -> dict[int, float]:
+        """Class scores of these keyframes; those that share no class with the query are left out."""
+        return class_filter.class_scores(self.engine, map_id, query, keyframe_ids)
+
+    def document_frequencies(self, map_id: int, categories: Collection[str]) -> dict[str, int]:
+        """How many keyframes of a map show a class."""
+        return class_filter.document_frequencies(self.engine, map_id, categories)
+
+    def keyframe_count(self, map_id: int) -> int:
+        """How many keyframes a map holds."""
+        return class_filter.keyframe_count(self.engine, map_id)
 
     def keyframe_ids(self, map_id: int) -> list[int]:
         """Ids of all keyframes of a map, ascending."""
@@ -156,6 +183,10 @@ class Store:
     def load_vectors(self, keyframe_ids: Sequence[int]) -> Float32Array:
         """CNN vectors float32 ``[n, d]`` in the order of `keyframe_ids`. Raises NotFoundError, CodecError."""
         return reading.load_vectors(self.engine, keyframe_ids)
+
+    def vectors_there(self, keyframe_ids: Int64Array) -> tuple[Int64Array, Float32Array]:
+        """CNN vectors ``[n, d]`` of those keyframes that are there, and their ids, ascending. Raises CodecError."""
+        return scanning.vectors_there(self.engine, keyframe_ids)
 
     def load_keyframes(self, keyframe_ids: Sequence[int], *, descriptors: bool = True) -> list[StoredKeyframe]:
         """Keyframes in the order of `keyframe_ids`. Raises NotFoundError, CodecError."""
@@ -169,13 +200,21 @@ class Store:
         """Object masks ``[H, W]`` of a keyframe, by ordinal. Raises CodecError."""
         return reading.load_masks(self.engine, keyframe_id)
 
-    def poses(self, map_id: int) -> tuple[list[int], FloatArray]:
-        """Ids (ascending) and poses ``[n, 4, 4]`` of all keyframes of a map."""
-        return reading.poses(self.engine, map_id)
+    def poses(self, map_id: int, keyframe_ids: Sequence[int] | None = None) -> tuple[list[int], FloatArray]:
+        """Ids (ascending) and poses ``[n, 4, 4]`` of a map's keyframes: all, or those of `keyframe_ids`."""
+        return reading.poses(self.engine, map_id, keyframe_ids)
 
     def changes_since(self, map_id: int, change_id: int) -> list[Change]:
         """Changes of a map's keyframes after `change_id` (0: all), ascending."""
-        return reading.changes_since(self.engine, map_id, change_id)
+        return change_log.changes_since(self.engine, map_id, change_id)
+
+    def change_mark(self, map_id: int, change_id: int) -> ChangeMark:
+        """What the log of changes holds after `change_id`, in three numbers: equal marks, nothing new."""
+        return change_log.change_mark(self.engine, map_id, change_id)
+
+    def iter_vectors(self, map_id: int, chunk: int = 2000) -> Iterator[tuple[Int64Array, Float32Array]]:
+        """All vectors of a map in chunks: ids int64 ``[n]``, ascending, and vectors ``[n, d]``. Raises CodecError."""
+        return scanning.iter_vectors(self.engine, map_id, chunk)
 
     def planned_frames(self, map_name: str, recording: str) -> tuple[int, ...]:
         """Frame indexes of the stored plan of a recording, ascending; empty where there is none."""

@@ -8,13 +8,13 @@ costs time instead of the answer.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-
-from semdb.types import Float32Array, FloatArray
+from semdb.class_score import ClassQuery, class_query
+from semdb.localization.ranking import best_first
+from semdb.types import Float32Array, FloatArray, Int64Array
 
 FOLLOWING = 30  # keyframes after those of a batch that are looked through for a place that looks the same
 
@@ -34,6 +34,7 @@ class CoarseOptions:
 
     use_classes: bool = True
     minimum_share: float = 0.5  # of the query's idf-weighted objects that a keyframe must share to pass
+    filtered_at_most: int = 1000  # of the keyframes that pass, those with the best class score are ranked
     class_weight: float = 0.15  # of the class score beside the cosine in the soft stage
     filtered_batches: tuple[int, ...] = (1, 2)
     soft_batches: tuple[int, ...] = (3,)
@@ -60,47 +61,68 @@ class Batch:
     following: tuple[Proposal, ...] = ()  # what comes next in the same order, as far as it may look alike
 
 
-class CoarseSource(Protocol):
-    """Where class scores and vectors come from: SQL, or a mirror of the database in memory."""
+@dataclass(frozen=True, slots=True)
+class MapChange:
+    """What changed in a map between two looks at it. An empty one is false."""
 
-    def refresh(self) -> bool:
-        """Takes notice of what changed in the database since the last call; whether anything did."""
+    added: frozenset[int] = frozenset()  # keyframes that were not there
+    gone: frozenset[int] = frozenset()  # deleted or described anew: what is kept of them is out of date
+    everything: bool = False  # not known what: nothing that is kept can be relied on
 
-    def keyframe_ids(self) -> Sequence[int]:
-        """All keyframes of the map, ascending."""
-
-    def class_scores(self, counts: Mapping[str, float]) -> dict[int, float]:
-        """Score 0..1 of every keyframe that shares a class with `counts`; the others are not in it."""
-
-    def filtered(self, counts: Mapping[str, float], minimum_share: float) -> dict[int, float]:
-        """Those whose score is at least `minimum_share`: the class-attribute filter."""
-
-    def vectors(self, keyframe_ids: Sequence[int]) -> Float32Array:
-        """Unit vectors ``[n, d]`` in the order of `keyframe_ids`."""
+    def __bool__(self) -> bool:
+        return self.everything or bool(self.added) or bool(self.gone)
 
 
-def rank_by_score(keyframe_ids: Sequence[int], scores: FloatArray) -> list[int]:
-    """Positions in order of falling score; ties in ascending order of id, so that every source agrees."""
-    return [int(i) for i in np.lexsort((np.asarray(keyframe_ids), -scores))]
+@dataclass(frozen=True, slots=True, eq=False)
+class Scored:
+    """Keyframes with class scores, best first, equal ones by ascending id."""
+
+    keyframe_ids: Int64Array  # [n]
+    class_scores: FloatArray  # [n] 0..1
 
 
-class _Cosines:
-    """Cosines of the query with keyframes, each fetched once."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Ranked:
+    """Keyframes with class scores and cosines in the order of a ranking."""
 
-    def __init__(self, source: CoarseSource, query_vector: Float32Array) -> None:
-        self._source = source
-        self._query = query_vector
-        self._known: dict[int, float] = {}
-
-    def of(self, keyframe_ids: Sequence[int]) -> FloatArray:
-        missing = [i for i in keyframe_ids if i not in self._known]
-        if missing:
-            cosines = self._source.vectors(missing).astype(np.float64) @ self._query.astype(np.float64)
-            self._known.update(zip(missing, cosines.tolist(), strict=True))
-        return np.array([self._known[i] for i in keyframe_ids], dtype=np.float64)
+    keyframe_ids: Int64Array  # [n]
+    class_scores: FloatArray  # [n] 0..1
+    cosines: FloatArray  # [n]
 
     def __len__(self) -> int:
-        return len(self._known)
+        return len(self.keyframe_ids)
+
+
+class CoarseSource(Protocol):
+    """Where the coarse step asks: SQL, which is the reference, or an index in memory. Both give the same answers.
+
+    Between two calls of `refresh` an index answers from one state of the map. A source serves one thread.
+    """
+
+    def refresh(self) -> MapChange:
+        """Takes notice of what changed in the database since the last call (the first one tells of no change)."""
+
+    def keyframe_count(self) -> int:
+        """How many keyframes the map holds."""
+
+    def document_frequencies(self, categories: Collection[str]) -> dict[str, int]:
+        """How many keyframes of the map show a class; one that none shows may be left out."""
+
+    def filtered(self, query: ClassQuery, minimum_share: float, at_most: int | None) -> Scored:
+        """The class-attribute filter: keyframes whose class score is at least `minimum_share` (and above 0).
+
+        With `at_most`, only the best of them: by falling class score, then by ascending id.
+        """
+
+    def cosines(self, vector: Float32Array, keyframe_ids: Int64Array) -> FloatArray:
+        """Cosines ``[n]`` of the unit vector ``[d]`` with these keyframes; NaN for one that is not there any more."""
+
+    def nearest(self, vector: Float32Array, count: int, query: ClassQuery | None, class_weight: float) -> Ranked:
+        """The best `count` keyframes of the whole map by ``cosine + class_weight * class score``, ties by id.
+
+        Without `query` by cosine alone, all class scores 0. Cosines of those returned are exact. An index of a large
+        map may find them by a reduced scan: then a keyframe is missed in at most one of a hundred places.
+        """
 
 
 def cascade(
@@ -110,47 +132,52 @@ def cascade(
 
     `counts` are the objects of the query per class, `query_vector` ``[d]`` its unit CNN vector.
     """
-    cosines = _Cosines(source, query_vector)
     seen: set[int] = set()
-    use_classes = options.use_classes and bool(counts)
-    if use_classes:
-        passed = source.filtered(counts, options.minimum_share)
-        yield from _stage(Stage.FILTERED, sorted(passed), passed, cosines, seen, options.filtered_batches, 0.0)
+    ranked = 0
+    query = _class_query(source, counts) if options.use_classes and counts else None
+    if query is not None:
+        passed = _rank_filtered(source, query, query_vector, options)
+        ranked = len(passed)
+        yield from _batches(Stage.FILTERED, passed, seen, options.filtered_batches, ranked)
     if options.use_classes and not options.cascade:
         return  # the hard filter has the last word, also where no object is detected
-    everything = list(source.keyframe_ids())
-    scores = source.class_scores(counts) if use_classes else {}
-    if use_classes:
-        yield from _stage(Stage.SOFT, everything, scores, cosines, seen, options.soft_batches, options.class_weight)
-        batches = options.all_batches
-    else:
-        batches = (*options.filtered_batches, *options.soft_batches, *options.all_batches)
-    yield from _stage(Stage.ALL, everything, scores, cosines, seen, batches, 0.0)
+    stages = [(Stage.ALL, (*options.filtered_batches, *options.soft_batches, *options.all_batches), 0.0)]
+    if query is not None:
+        stages = [(Stage.SOFT, options.soft_batches, options.class_weight), (Stage.ALL, options.all_batches, 0.0)]
+    for stage, batches, weight in stages:
+        everything = source.nearest(query_vector, len(seen) + sum(batches) + FOLLOWING, query, weight)
+        ranked = max(ranked, source.keyframe_count()) if len(everything) else ranked
+        yield from _batches(stage, everything, seen, batches, ranked)
 
 
-def _stage(
-    name: str,
-    keyframe_ids: Sequence[int],
-    class_scores: dict[int, float],
-    cosines: _Cosines,
-    seen: set[int],
-    batches: Sequence[int],
-    class_weight: float,
-) -> Iterator[Batch]:
-    if not keyframe_ids:
-        return
-    cosine = cosines.of(keyframe_ids)
-    classes = np.array([class_scores.get(i, 0.0) for i in keyframe_ids])
-    order = [p for p in rank_by_score(keyframe_ids, cosine + class_weight * classes) if keyframe_ids[p] not in seen]
+def _class_query(source: CoarseSource, counts: Mapping[str, float]) -> ClassQuery:
+    return class_query(counts, source.keyframe_count(), source.document_frequencies(counts))
+
+
+def _rank_filtered(
+    source: CoarseSource, query: ClassQuery, query_vector: Float32Array, options: CoarseOptions
+) -> Ranked:
+    passed = source.filtered(query, options.minimum_share, options.filtered_at_most)
+    cosines = source.cosines(query_vector, passed.keyframe_ids)
+    order = best_first(passed.keyframe_ids, cosines)
+    return Ranked(passed.keyframe_ids[order], passed.class_scores[order], cosines[order])
+
+
+def _batches(name: str, ranked: Ranked, seen: set[int], sizes: Sequence[int], looked_at: int) -> Iterator[Batch]:
+    """Batches of what was not seen before; only as much of the ranking is turned into proposals as they need."""
+    wanted = len(seen) + sum(sizes) + FOLLOWING
+    rows = zip(
+        ranked.keyframe_ids[:wanted].tolist(),
+        ranked.class_scores[:wanted].tolist(),
+        ranked.cosines[:wanted].tolist(),
+        strict=True,
+    )
+    new = [Proposal(*row) for row in rows if row[0] not in seen]
     start = 0
-    for size in batches:
-        chosen = order[start : start + size]
+    for size in sizes:
+        chosen = tuple(new[start : start + size])
         start += size
         if not chosen:
             return
-        seen.update(keyframe_ids[p] for p in chosen)
-        proposals, following = (
-            tuple(Proposal(keyframe_ids[p], float(classes[p]), float(cosine[p])) for p in positions)
-            for positions in (chosen, order[start : start + FOLLOWING])
-        )
-        yield Batch(name, proposals, len(cosines), following)
+        seen.update(proposal.keyframe_id for proposal in chosen)
+        yield Batch(name, chosen, looked_at, tuple(new[start : start + FOLLOWING]))

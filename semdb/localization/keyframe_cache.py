@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Sequence
 
+import numpy as np
+
 from semdb.database.records import StoredKeyframe
 from semdb.database.store import Store
 from semdb.errors import NotFoundError
+from semdb.localization.coarse import MapChange
 from semdb.localization.views import ClassNumbers, KeyframeView, make_keyframe_view
 from semdb.types import FloatArray
 
@@ -23,12 +26,20 @@ class KeyframeCache:
         self._views: OrderedDict[int, KeyframeView] = OrderedDict()
         self._names: dict[int, tuple[str, int]] = {}
         self._poses: tuple[list[int], FloatArray] | None = None
+        self._stale: set[int] = set()  # keyframes whose poses are to be read again
 
-    def forget(self) -> None:
-        """Drops everything: the map has changed."""
-        self._views.clear()
-        self._names.clear()
-        self._poses = None
+    def forget(self, change: MapChange) -> None:
+        """Drops what is out of date; poses of added keyframes are read when they are asked for."""
+        if change.everything:
+            self._views.clear()
+            self._names.clear()
+            self._poses = None
+            return
+        for keyframe_id in change.gone:
+            self._views.pop(keyframe_id, None)
+            self._names.pop(keyframe_id, None)
+        if self._poses is not None:
+            self._stale |= change.added | change.gone
 
     def views(self, keyframe_ids: Sequence[int]) -> list[KeyframeView]:
         """Views in the order of `keyframe_ids`; a keyframe deleted meanwhile is left out."""
@@ -68,7 +79,15 @@ class KeyframeCache:
         return self._names.get(keyframe_id, ("", -1))
 
     def poses(self) -> tuple[list[int], FloatArray]:
-        """Ids and ``world_from_camera`` ``[n, 4, 4]`` of all keyframes of the map."""
+        """Ids, ascending, and ``world_from_camera`` ``[n, 4, 4]`` of all keyframes of the map."""
         if self._poses is None:
             self._poses = self._store.poses(self._map_id)
+        elif self._stale:
+            ids = np.array(self._poses[0], np.int64)
+            kept = ~np.isin(ids, list(self._stale))
+            new_ids, new_poses = self._store.poses(self._map_id, sorted(self._stale))
+            ids = np.concatenate([ids[kept], np.array(new_ids, np.int64)])
+            order = np.argsort(ids, kind="stable")
+            self._poses = ids[order].tolist(), np.concatenate([self._poses[1][kept], new_poses])[order]
+        self._stale.clear()
         return self._poses

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from semdb.class_score import ClassQuery
 from semdb.database.planning import check_models
 from semdb.errors import NotFoundError
 from semdb.geometry import pose_distances
-from semdb.localization.coarse import Batch, CoarseOptions, CoarseSource, Proposal, Stage, cascade
+from semdb.localization.coarse import Batch, CoarseOptions, CoarseSource, Proposal, Scored, Stage, cascade
 from semdb.localization.keyframe_cache import KeyframeCache
 from semdb.localization.matching import Matches
 from semdb.localization.pose import PoseEstimate, PoseOptions, estimate_pose, match_view, rival_pose
@@ -75,9 +76,8 @@ class Localizer:
 
         Raises ProvenanceError when other models made the map, NotFoundError when the map holds no keyframe.
         """
-        keyframe_ids = self._check(description)
-        search = _Search(self._view_of(description), len(keyframe_ids))
-        source = _OneQuery(self.source, keyframe_ids)
+        search = _Search(self._view_of(description), self._check(description))
+        source = _TimedSource(self.source)
         started = time.perf_counter()
         for batch in cascade(source, _class_counts(description), description.cnn_vector, self.options.coarse):
             search.timing_ms["rank"] += _ms_since(started)
@@ -91,20 +91,21 @@ class Localizer:
 
     def localize_among(self, description: Description, keyframe_ids: Sequence[int]) -> Localization:
         """The fine step alone, on keyframes that the caller names (the `oracle` of evaluations)."""
-        search = _Search(self._view_of(description), len(self._check(description)))
+        search = _Search(self._view_of(description), self._check(description))
         proposals = tuple(Proposal(i, float("nan"), float("nan")) for i in keyframe_ids)
         self._try(search, Batch(Stage.GIVEN, proposals, 0))
         return self._conclude(search)
 
-    def _check(self, description: Description) -> Sequence[int]:
-        """The keyframes of the map, once it is known that they can be compared with `description`."""
-        if self.source.refresh():
-            self.cache.forget()
-        keyframe_ids = self.source.keyframe_ids()
-        if not keyframe_ids:
+    def _check(self, description: Description) -> int:
+        """How many keyframes the map holds, once it is known that they can be compared with `description`."""
+        change = self.source.refresh()
+        if change:
+            self.cache.forget(change)
+        keyframes = self.source.keyframe_count()
+        if not keyframes:
             raise NotFoundError(f"map {self.map_name!r} holds no keyframe: ingest a recording into it first")
         check_models(self.models, description.models, f"the map {self.map_name!r}")
-        return keyframe_ids
+        return keyframes
 
     def _view_of(self, description: Description) -> View:
         categories = [detection.category for detection in description.detections]
@@ -224,34 +225,28 @@ class Localizer:
         )
 
 
-class _OneQuery:
-    """A source for one query: the keyframes of the map are known, and the time of the class filter is added up."""
+class _TimedSource:
+    """A source for one query that adds up the time of the class filter."""
 
-    def __init__(self, source: CoarseSource, keyframe_ids: Sequence[int]) -> None:
+    def __init__(self, source: CoarseSource) -> None:
         self._source = source
-        self._keyframe_ids = keyframe_ids
+        self.refresh = source.refresh
+        self.keyframe_count = source.keyframe_count
+        self.cosines = source.cosines
+        self.nearest = source.nearest
         self.filter_ms = 0.0
 
-    def refresh(self) -> bool:
-        return self._source.refresh()
-
-    def keyframe_ids(self) -> Sequence[int]:
-        return self._keyframe_ids
-
-    def class_scores(self, counts: Mapping[str, float]) -> dict[int, float]:
+    def document_frequencies(self, categories: Collection[str]) -> dict[str, int]:
         started = time.perf_counter()
-        scores = self._source.class_scores(counts)
+        found = self._source.document_frequencies(categories)
         self.filter_ms += _ms_since(started)
-        return scores
+        return found
 
-    def filtered(self, counts: Mapping[str, float], minimum_share: float) -> dict[int, float]:
+    def filtered(self, query: ClassQuery, minimum_share: float, at_most: int | None) -> Scored:
         started = time.perf_counter()
-        scores = self._source.filtered(counts, minimum_share)
+        found = self._source.filtered(query, minimum_share, at_most)
         self.filter_ms += _ms_since(started)
-        return scores
-
-    def vectors(self, keyframe_ids: Sequence[int]) -> Float32Array:
-        return self._source.vectors(keyframe_ids)
+        return found
 
 
 def _class_counts(description: Description) -> dict[str, float]:

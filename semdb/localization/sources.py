@@ -1,18 +1,71 @@
-"""Where the coarse step reads from: SQL, which is the reference, or a mirror of one map in memory."""
+"""Where the coarse step asks: SQL, which is the reference, or a mirror of one map in memory."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection
 
 import numpy as np
 
-from semdb.database.class_filter import class_weight
+from semdb.class_score import ClassQuery
+from semdb.database.records import Change, ChangeKind, ChangeMark
 from semdb.database.store import Store
-from semdb.types import Float32Array, IntArray
+from semdb.localization.coarse import MapChange, Ranked, Scored
+from semdb.localization.ranking import best_first, exact_cosines
+from semdb.types import Float32Array, FloatArray, Int64Array
 
 # Change ids commit out of order: how far behind the newest one a late one may still turn up.
 OVERLAP = 1000
+NOTHING = ChangeMark(0, 0, 0)
+
+
+class ChangeReader:
+    """Tells what the log of changes has that was not seen before, at the price of one small query when nothing has.
+
+    Ids commit out of order, so it looks again at the last `overlap` ids before the newest that it has seen.
+    """
+
+    def __init__(self, store: Store, map_id: int, overlap: int = OVERLAP) -> None:
+        self._store = store
+        self._map_id = map_id
+        self._overlap = overlap
+        self._newest = 0
+        self._mark = NOTHING
+        self._seen: frozenset[int] = frozenset()
+
+    def skip(self) -> None:
+        """What the log holds now counts as seen."""
+        self._newest = self._store.change_mark(self._map_id, 0).newest
+        self._mark, self._seen = NOTHING, frozenset()
+        self.read()
+
+    def read(self) -> list[Change] | None:
+        """Changes that were not seen before, ascending; each is told once.
+
+        None when the newest that was seen is not there any more: the log was cut off, or is another database's.
+        """
+        since = max(0, self._newest - self._overlap)
+        mark = self._store.change_mark(self._map_id, since)
+        if mark == self._mark:
+            return []
+        if mark.newest < self._newest:
+            self.skip()
+            return None
+        changes = self._store.changes_since(self._map_id, since)
+        new = [change for change in changes if change.id not in self._seen]
+        self._newest = max([self._newest, *(change.id for change in changes)])
+        since = max(0, self._newest - self._overlap)
+        self._seen = frozenset(change.id for change in changes if change.id > since)
+        self._mark = ChangeMark(max(self._seen, default=0), len(self._seen), sum(self._seen))
+        return new
+
+
+def summary_of(changes: list[Change] | None) -> MapChange:
+    """Changes as sets of keyframes. One that was added and then deleted is only gone."""
+    if changes is None:
+        return MapChange(everything=True)
+    gone = frozenset(change.keyframe_id for change in changes if change.kind is not ChangeKind.ADDED)
+    added = frozenset(change.keyframe_id for change in changes if change.kind is ChangeKind.ADDED)
+    return MapChange(added - gone, gone)
 
 
 class SqlSource:
@@ -21,88 +74,108 @@ class SqlSource:
     def __init__(self, store: Store, map_id: int) -> None:
         self._store = store
         self._map_id = map_id
-        self._seen: list[int] | None = None
+        self._changes = ChangeReader(store, map_id)
+        self._count: int | None = None
 
-    def refresh(self) -> bool:
-        """Nothing is kept here, but what others keep of the map is out of date when its keyframes are others."""
-        ids = self._store.keyframe_ids(self._map_id)
-        changed = self._seen is not None and ids != self._seen
-        self._seen = ids
-        return changed
+    def refresh(self) -> MapChange:
+        """Nothing is kept here but the number of keyframes; what others keep may be out of date."""
+        if self._count is None:
+            self._changes.skip()
+            self._count = self._store.keyframe_count(self._map_id)
+            return MapChange()
+        change = summary_of(self._changes.read())
+        if change:
+            self._count = self._store.keyframe_count(self._map_id)
+        return change
 
-    def keyframe_ids(self) -> Sequence[int]:
-        return self._store.keyframe_ids(self._map_id)
+    def keyframe_count(self) -> int:
+        if self._count is None:
+            self.refresh()
+        return self._count or 0
 
-    def class_scores(self, counts: Mapping[str, float]) -> dict[int, float]:
-        return {k.keyframe_id: k.class_score for k in self._store.class_scores(self._map_id, counts)}
+    def document_frequencies(self, categories: Collection[str]) -> dict[str, int]:
+        return self._store.document_frequencies(self._map_id, categories)
 
-    def filtered(self, counts: Mapping[str, float], minimum_share: float) -> dict[int, float]:
-        return {k.keyframe_id: k.class_score for k in self._store.class_filter(self._map_id, counts, minimum_share)}
+    def filtered(self, query: ClassQuery, minimum_share: float, at_most: int | None) -> Scored:
+        found = self._store.class_filter(self._map_id, query, minimum_share, at_most)
+        ids = np.array([keyframe.keyframe_id for keyframe in found], np.int64)
+        return Scored(ids, np.array([keyframe.class_score for keyframe in found], np.float64))
 
-    def vectors(self, keyframe_ids: Sequence[int]) -> Float32Array:
-        return self._store.load_vectors(keyframe_ids)
+    def cosines(self, vector: Float32Array, keyframe_ids: Int64Array) -> FloatArray:
+        ids, vectors = self._store.vectors_there(keyframe_ids)
+        result = np.full(len(keyframe_ids), np.nan)
+        if len(ids):
+            place = np.minimum(np.searchsorted(ids, keyframe_ids), len(ids) - 1)
+            there = ids[place] == keyframe_ids
+            result[there] = exact_cosines(vectors, place[there], vector)
+        return result
+
+    def nearest(self, vector: Float32Array, count: int, query: ClassQuery | None, class_weight: float) -> Ranked:
+        """Reads all vectors of the map, a chunk at a time."""
+        shared = self.filtered(query, 0.0, None) if query is not None else Scored(np.empty(0, np.int64), np.empty(0))
+        known = dict(zip(shared.keyframe_ids.tolist(), shared.class_scores.tolist(), strict=True))
+        best = Ranked(np.empty(0, np.int64), np.empty(0), np.empty(0))
+        for ids, vectors in self._store.iter_vectors(self._map_id):
+            scores = np.array([known.get(i, 0.0) for i in ids.tolist()])
+            cosines = exact_cosines(vectors, np.arange(len(ids)), vector)
+            both = Ranked(
+                np.concatenate([best.keyframe_ids, ids]),
+                np.concatenate([best.class_scores, scores]),
+                np.concatenate([best.cosines, cosines]),
+            )
+            order = best_first(both.keyframe_ids, both.cosines + class_weight * both.class_scores, count)
+            best = Ranked(both.keyframe_ids[order], both.class_scores[order], both.cosines[order])
+        return best
 
 
 class MemorySource:
-    """A mirror of one map: counts per class and keyframe, and all vectors. Gives what `SqlSource` gives.
-
-    `refresh` rereads the map when the change log says that it changed, by this or any other process.
-    """
+    """A mirror of one map: counts per class and keyframe, and all vectors. Reread when the map changes."""
 
     def __init__(self, store: Store, map_id: int) -> None:
         self._store = store
         self._map_id = map_id
-        self._seen: set[int] = set()
-        self._newest = 0
-        self._ids: list[int] = []
-        self._position: dict[int, int] = {}
-        self._counts: IntArray = np.zeros((0, 0), np.int32)  # [classes, keyframes]
-        self._classes: dict[str, int] = {}
-        self._vectors: Float32Array = np.zeros((0, 0), np.float32)
-        if not self.refresh():
-            self._load()
+        self._changes = ChangeReader(store, map_id)
+        self._changes.skip()
+        self._load()
 
-    def refresh(self) -> bool:
-        """Rereads the map if it changed since the last call; whether it did."""
-        changes = self._store.changes_since(self._map_id, max(0, self._newest - OVERLAP))
-        ids = {change.id for change in changes}
-        new = ids - self._seen
-        self._newest = max([self._newest, *ids])
-        self._seen = {i for i in self._seen | ids if i > self._newest - 2 * OVERLAP}
-        if new:
+    def refresh(self) -> MapChange:
+        change = summary_of(self._changes.read())
+        if change:
             self._load()
-        return bool(new)
+        return change
 
     def _load(self) -> None:
-        self._ids = list(self._store.keyframe_ids(self._map_id))
-        self._position = {keyframe_id: p for p, keyframe_id in enumerate(self._ids)}
-        rows = [row for row in self._store.category_counts(self._map_id) if row[0] in self._position]
-        self._classes = {name: p for p, name in enumerate(sorted({row[1] for row in rows}))}
-        self._counts = np.zeros((len(self._classes), len(self._ids)), np.int32)
-        for keyframe_id, name, count in rows:
-            self._counts[self._classes[name], self._position[keyframe_id]] += count
-        self._vectors = self._store.load_vectors(self._ids)
+        parts = list(self._store.iter_vectors(self._map_id))
+        self._ids = np.concatenate([np.empty(0, np.int64), *(ids for ids, _ in parts)])
+        self._vectors = np.concatenate([vectors for _, vectors in parts]) if parts else np.empty((0, 0), np.float32)
+        self._counts: dict[str, FloatArray] = {}
+        for keyframe_id, name, count in self._store.category_counts(self._map_id):
+            row = self._counts.setdefault(name, np.zeros(len(self._ids)))
+            row[np.searchsorted(self._ids, keyframe_id)] += count
 
-    def keyframe_ids(self) -> Sequence[int]:
-        return self._ids
+    def keyframe_count(self) -> int:
+        return len(self._ids)
 
-    def class_scores(self, counts: Mapping[str, float]) -> dict[int, float]:
-        return self.filtered(counts, 0.0)
+    def document_frequencies(self, categories: Collection[str]) -> dict[str, int]:
+        return {name: int(np.count_nonzero(self._counts[name])) for name in categories if name in self._counts}
 
-    def filtered(self, counts: Mapping[str, float], minimum_share: float) -> dict[int, float]:
-        """The same integer arithmetic as the SQL, so the same scores to the last bit."""
-        shared = np.zeros(len(self._ids), np.int64)
-        total = 0
-        for name in sorted(name for name, count in counts.items() if count > 0):
-            row = self._classes.get(name)
-            held = np.zeros(len(self._ids), np.int32) if row is None else self._counts[row]
-            weight = class_weight(row, counts[name], len(self._ids), int(np.count_nonzero(held)))
-            total += weight.full
-            enough = held >= math.ceil(weight.wanted)
-            shared += np.where(enough, weight.full, weight.per_object * held.astype(np.int64))
-        least = max(1, math.ceil(minimum_share * total - 1e-6))
-        return {self._ids[p]: int(shared[p]) / total for p in np.flatnonzero(shared >= least)}
+    def _shared(self, query: ClassQuery | None) -> FloatArray:
+        shared = np.zeros(len(self._ids))
+        for term in query.terms if query is not None else ():
+            if term.category in self._counts:
+                shared += np.minimum(term.full, term.per_object * self._counts[term.category])
+        return shared
 
-    def vectors(self, keyframe_ids: Sequence[int]) -> Float32Array:
-        rows = [self._position[i] for i in keyframe_ids]
-        return self._vectors[rows]
+    def filtered(self, query: ClassQuery, minimum_share: float, at_most: int | None) -> Scored:
+        shared = self._shared(query)
+        order = best_first(self._ids, np.where(shared >= query.least(minimum_share), shared, np.nan), at_most)
+        return Scored(self._ids[order], shared[order] / query.total)
+
+    def cosines(self, vector: Float32Array, keyframe_ids: Int64Array) -> FloatArray:
+        return exact_cosines(self._vectors, np.searchsorted(self._ids, keyframe_ids), vector)
+
+    def nearest(self, vector: Float32Array, count: int, query: ClassQuery | None, class_weight: float) -> Ranked:
+        cosines = exact_cosines(self._vectors, np.arange(len(self._ids)), vector)
+        scores = self._shared(query) / (query.total if query is not None else 1)
+        order = best_first(self._ids, cosines + class_weight * scores, count)
+        return Ranked(self._ids[order], scores[order], cosines[order])

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from semdb.class_score import SCALE, ClassQuery, ClassTerm, class_term
 from semdb.database import schema
-from semdb.database.class_filter import SCALE, class_weight, class_weights
 from semdb.database.engine import make_engine
 from semdb.database.records import ScoredKeyframe
 from semdb.database.store import Store, open_store
@@ -73,45 +73,68 @@ def _expected(counts: dict[str, float], ids: list[int]) -> list[ScoredKeyframe]:
 def test_scores_are_those_of_the_formula(store: Store, filled: tuple[int, list[int]], counts: dict[str, float]) -> None:
     map_id, ids = filled
     expected = _expected(counts, ids)
-    scored = store.class_scores(map_id, counts)
+    query = store.class_query(map_id, counts)
+    scored = store.class_filter(map_id, query, 0.0)
     assert [item.keyframe_id for item in scored] == [item.keyframe_id for item in expected]
     np.testing.assert_allclose(
         [item.class_score for item in scored], [item.class_score for item in expected], atol=2e-6
     )
-    half = store.class_filter(map_id, counts, 0.5)
+    half = store.class_filter(map_id, query, 0.5)
     assert half == [item for item in scored if item.class_score >= 0.5]
+    for at_most in (1, 2, 100):
+        assert store.class_filter(map_id, query, 0.0, at_most) == scored[:at_most]
+    assert store.class_scores(map_id, query, [*ids, 10**9]) == {k.keyframe_id: k.class_score for k in scored}
+    assert store.class_scores(map_id, query, ids[:2]).keys() <= set(ids[:2])
+
+
+def _filter(store: Store, map_id: int, counts: dict[str, float], share: float) -> list[ScoredKeyframe]:
+    return store.class_filter(map_id, store.class_query(map_id, counts), share)
 
 
 def test_the_best_keyframe_has_everything(store: Store, filled: tuple[int, list[int]]) -> None:
     map_id, ids = filled
-    (best,) = store.class_filter(map_id, {"chair": 1, "cup": 1, "laptop": 1, "tv": 1}, 1.0)
+    (best,) = _filter(store, map_id, {"chair": 1, "cup": 1, "laptop": 1, "tv": 1}, 1.0)
     assert best == ScoredKeyframe(ids[5], 1.0)
-    full = store.class_filter(map_id, {"cup": 1}, 1.0)  # four equal scores, by id
+    full = _filter(store, map_id, {"cup": 1}, 1.0)  # four equal scores, by id
     assert full == [ScoredKeyframe(ids[i], 1.0) for i in (0, 2, 4, 5)]
+    assert _filter(store, map_id, {"cup": 4.7}, 1.0) == [ScoredKeyframe(ids[4], 1.0)]  # which shows five
 
 
 def test_nothing_shared_is_nothing_found(store: Store, filled: tuple[int, list[int]]) -> None:
     map_id, _ = filled
-    assert store.class_scores(map_id, {}) == []
-    assert store.class_scores(map_id, {"zebra": 3}) == []
-    assert store.class_scores(map_id, {"potted plant": 1}) == []
-    assert store.class_scores(store.ensure_map("empty"), {"chair": 1}) == []
-    assert store.class_filter(map_id, {"chair": 1, "zebra": 9}, 0.5) == []
+    assert _filter(store, map_id, {}, 0.0) == []
+    assert _filter(store, map_id, {"zebra": 3}, 0.0) == []
+    assert _filter(store, map_id, {"potted plant": 1}, 0.0) == []
+    assert _filter(store, store.ensure_map("empty"), {"chair": 1}, 0.0) == []
+    assert _filter(store, map_id, {"chair": 1, "zebra": 9}, 0.5) == []
     for bad in (-1.0, math.nan, math.inf):
         with pytest.raises(UsageError, match="count of the class 'chair'"):
-            store.class_scores(map_id, {"chair": bad})
+            store.class_query(map_id, {"chair": bad})
 
 
 def test_rare_classes_weigh_more(store: Store, filled: tuple[int, list[int]]) -> None:
     map_id, _ = filled
-    weights = {w.wanted: w for w in class_weights(store.engine, map_id, {"chair": 1, "tv": 2, "zebra": 3})}
-    chair, tv, zebra = weights[1], weights[2], weights[3]
+    query = store.class_query(map_id, {"chair": 1, "tv": 2, "zebra": 3, "cup": 0})
+    chair, tv, zebra = query.terms
+    assert [chair.category, tv.category, zebra.category] == ["chair", "tv", "zebra"]
     assert chair.per_object == round(SCALE * (math.log(7 / 4) + 1)) == chair.full
     assert tv.per_object == round(SCALE * (math.log(7 / 2) + 1))
-    assert zebra.category_id is None
     assert zebra.per_object == round(SCALE * (math.log(7) + 1))
     assert chair.per_object < tv.per_object < zebra.per_object
-    assert class_weight(1, 1.0, 0, 0).per_object == SCALE
+    assert query.total == chair.full + 2 * tv.per_object + 3 * zebra.per_object
+    assert class_term("cup", 1.0, 0, 0).per_object == SCALE
+
+
+def test_terms_may_be_given(store: Store, filled: tuple[int, list[int]]) -> None:
+    """A class that stands for another one, with a total of its own."""
+    map_id, ids = filled
+    query = ClassQuery((ClassTerm("chair", 30, 45), ClassTerm("person", 7, 10), ClassTerm("zebra", 5, 5)), 100)
+    found = store.class_filter(map_id, query, 0.0)
+    assert found == [ScoredKeyframe(ids[0], 0.45), ScoredKeyframe(ids[5], 0.37), ScoredKeyframe(ids[1], 0.3)]
+    assert store.class_filter(map_id, query, 0.37) == found[:2]
+    for terms in ((ClassTerm("cup", 1, 1),) * 2, (ClassTerm("cup", 0, 1),), (ClassTerm("cup", 1, 2**31),)):
+        with pytest.raises(UsageError):
+            ClassQuery(terms, 1)
 
 
 def test_scores_are_equal_to_the_last_bit_on_both_servers(tmp_path: Path, mariadb_url: str) -> None:
@@ -128,6 +151,6 @@ def test_scores_are_equal_to_the_last_bit_on_both_servers(tmp_path: Path, mariad
         with open_store(url) as store:
             map_id, _ = _fill(store)
             fill(store, "room", "more", range(30), seed=200)
-            answers.append([store.class_filter(map_id, query, 0.3) for query in queries])
+            answers.append([_filter(store, map_id, query, 0.3) for query in queries])
     assert answers[0] == answers[1]
     assert sum(map(len, answers[0])) == 146

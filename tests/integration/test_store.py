@@ -207,7 +207,8 @@ def test_same_names_in_two_maps_are_two_recordings(store: Store) -> None:
     assert first[1] != second[1]
     assert set(first[2]).isdisjoint(second[2])
     assert store.keyframe_ids(second[0]) == second[2]
-    scored = store.class_scores(second[0], dict.fromkeys(("chair", "cup", "laptop", "tv", "person"), 1.0))
+    query = store.class_query(second[0], dict.fromkeys(("chair", "cup", "laptop", "tv", "person"), 1.0))
+    scored = store.class_filter(second[0], query, 0.0)
     assert {item.keyframe_id for item in scored} <= set(second[2])
 
 

@@ -2,39 +2,52 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semdb.localization.coarse import Batch, CoarseOptions, Stage, cascade, rank_by_score
-from semdb.types import Float32Array
+from semdb.class_score import ClassQuery
+from semdb.localization.coarse import Batch, CoarseOptions, MapChange, Ranked, Scored, Stage, cascade
+from semdb.localization.ranking import best_first, exact_cosines
+from semdb.types import Float32Array, FloatArray, Int64Array
 
 
 class FakeSource:
-    """Scores and vectors as given; counts which vectors were asked for."""
+    """Class scores and vectors as given; keeps which cosines were asked for."""
 
     def __init__(self, scores: Mapping[int, float], vectors: Mapping[int, Sequence[float]]) -> None:
-        self._scores = scores
-        self._vectors = vectors
+        self._ids = np.array(sorted(vectors), np.int64)
+        self._scores = np.array([scores.get(int(i), 0.0) for i in self._ids])
+        self._vectors = np.array([vectors[int(i)] for i in self._ids], np.float32).reshape(len(self._ids), 2)
         self.asked: list[int] = []
+        self.at_most: list[int | None] = []
 
-    def refresh(self) -> bool:
-        return False
+    def refresh(self) -> MapChange:
+        return MapChange()
 
-    def keyframe_ids(self) -> Sequence[int]:
-        return sorted(self._vectors)
+    def keyframe_count(self) -> int:
+        return len(self._ids)
 
-    def class_scores(self, counts: Mapping[str, float]) -> dict[int, float]:
-        return dict(self._scores)
+    def document_frequencies(self, categories: Collection[str]) -> dict[str, int]:
+        return {}
 
-    def filtered(self, counts: Mapping[str, float], minimum_share: float) -> dict[int, float]:
-        return {i: score for i, score in self._scores.items() if score >= minimum_share}
+    def filtered(self, query: ClassQuery, minimum_share: float, at_most: int | None) -> Scored:
+        self.at_most.append(at_most)
+        passed = (self._scores > 0) & (self._scores >= minimum_share)
+        order = best_first(self._ids, np.where(passed, self._scores, np.nan), at_most)
+        return Scored(self._ids[order], self._scores[order])
 
-    def vectors(self, keyframe_ids: Sequence[int]) -> Float32Array:
-        self.asked += keyframe_ids
-        return np.array([self._vectors[i] for i in keyframe_ids], np.float32)
+    def cosines(self, vector: Float32Array, keyframe_ids: Int64Array) -> FloatArray:
+        self.asked += keyframe_ids.tolist()
+        return exact_cosines(self._vectors, np.searchsorted(self._ids, keyframe_ids), vector)
+
+    def nearest(self, vector: Float32Array, count: int, query: ClassQuery | None, class_weight: float) -> Ranked:
+        cosines = exact_cosines(self._vectors, np.arange(len(self._ids)), vector)
+        scores = self._scores if query is not None else np.zeros(len(self._ids))
+        order = best_first(self._ids, cosines + class_weight * scores, count)
+        return Ranked(self._ids[order], scores[order], cosines[order])
 
 
 def unit(degrees: float) -> list[float]:
@@ -70,7 +83,7 @@ def test_filtered_keyframes_first_then_soft_then_all() -> None:
 def test_the_filtered_stage_ranks_only_what_passed() -> None:
     source = FakeSource(SOURCE_SCORES, SOURCE_VECTORS)
     first = next(iter(cascade(source, {"cup": 1.0}, QUERY, CoarseOptions())))
-    assert source.asked == [2, 3]
+    assert sorted(source.asked) == [2, 3]
     assert first.proposals[0].class_score == 0.6
     assert abs(first.proposals[0].cosine - np.cos(np.radians(20))) < 1e-6
 
@@ -103,12 +116,47 @@ def test_nothing_passes_the_filter() -> None:
     assert batches[0].proposals[0].keyframe_id == 1
 
 
-@given(scores=st.lists(st.floats(-1, 1), max_size=12), seed=st.integers(0, 99))
-def test_rank_is_by_falling_score_then_by_id(scores: list[float], seed: int) -> None:
-    ids = np.random.default_rng(seed).permutation(len(scores)).tolist()
-    ranked = rank_by_score(ids, np.array(scores))
-    keys = [(-scores[p], ids[p]) for p in ranked]
-    assert keys == sorted(keys)
+def test_the_filter_gives_the_best_by_class_score_and_they_are_ranked_by_cosine() -> None:
+    source = FakeSource(SOURCE_SCORES, SOURCE_VECTORS)
+    options = CoarseOptions(minimum_share=0.1, filtered_at_most=2, filtered_batches=(9,))
+    first = next(iter(cascade(source, {"cup": 1.0}, QUERY, options)))
+    assert source.at_most == [2]
+    assert [proposal.keyframe_id for proposal in first.proposals] == [3, 2]
+    assert first.ranked == 2
+
+
+def test_a_keyframe_that_was_deleted_meanwhile_is_left_out() -> None:
+    class Late(FakeSource):
+        def cosines(self, vector: Float32Array, keyframe_ids: Int64Array) -> FloatArray:
+            cosines = super().cosines(vector, keyframe_ids)
+            return np.where(keyframe_ids == 3, np.nan, cosines)
+
+    first = next(iter(cascade(Late(SOURCE_SCORES, SOURCE_VECTORS), {"cup": 1.0}, QUERY, CoarseOptions())))
+    assert [proposal.keyframe_id for proposal in first.proposals] == [2]
+
+
+def test_what_follows_a_batch_is_named() -> None:
+    batches, _ = run(CoarseOptions(use_classes=False, filtered_batches=(1,), soft_batches=(), all_batches=(1,)))
+    assert [[p.keyframe_id for p in batch.following] for batch in batches] == [[4, 3, 2, 5], [3, 2, 5]]
+
+
+@given(scores=st.lists(st.floats(-1, 1), max_size=12), count=st.integers(0, 14), seed=st.integers(0, 99))
+def test_best_first_is_by_falling_score_then_by_id(scores: list[float], count: int, seed: int) -> None:
+    ids = np.random.default_rng(seed).permutation(len(scores)).astype(np.int64)
+    keys = sorted((-score, int(i)) for score, i in zip(scores, ids, strict=True))
+    assert [(-scores[p], int(ids[p])) for p in best_first(ids, np.array(scores), count)] == keys[:count]
+    assert [(-scores[p], int(ids[p])) for p in best_first(ids, np.array(scores))] == keys
+
+
+@given(size=st.integers(0, 40), rows=st.lists(st.integers(0, 8), max_size=9), seed=st.integers(0, 99))
+def test_a_cosine_does_not_depend_on_what_else_is_asked(size: int, rows: list[int], seed: int) -> None:
+    random = np.random.default_rng(seed)
+    vectors = random.normal(size=(9, size)).astype(np.float32)
+    query = random.normal(size=size).astype(np.float32)
+    together = exact_cosines(vectors, np.array(rows, np.int64), query)
+    alone = [exact_cosines(vectors[row : row + 1], np.zeros(1, np.int64), query)[0] for row in rows]
+    assert together.tolist() == alone
+    np.testing.assert_allclose(together, vectors[rows].astype(np.float64) @ query.astype(np.float64), atol=1e-12)
 
 
 @given(

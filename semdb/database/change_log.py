@@ -1,0 +1,38 @@
+"""Reading the log of changes: how a mirror of a map learns what changed."""
+
+from __future__ import annotations
+
+from sqlalchemy import Engine, func, select
+
+from semdb.database import retry
+from semdb.database.records import Change, ChangeKind, ChangeMark
+from semdb.database.tables import keyframe_changes
+from semdb.errors import DatabaseError
+
+
+def changes_since(engine: Engine, map_id: int, change_id: int) -> list[Change]:
+    """Changes of a map with an id above `change_id`, ascending.
+
+    Ids commit out of order: a reader that keeps a mirror asks again from some way back and applies changes twice.
+    """
+    c = keyframe_changes.c
+    query = select(c.id, c.keyframe_id, c.kind).where(c.map_id == map_id, c.id > change_id).order_by(c.id)
+    rows = retry.read(engine, lambda connection: list(connection.execute(query)))
+    try:
+        return [Change(row.id, row.keyframe_id, ChangeKind(row.kind)) for row in rows]
+    except ValueError as error:
+        raise DatabaseError(
+            f"the change log holds a kind that this semdb does not know ({error}): upgrade it"
+        ) from error
+
+
+def change_mark(engine: Engine, map_id: int, change_id: int) -> ChangeMark:
+    """The changes of a map above `change_id` in three numbers: cheap to ask for, different when there is a new one.
+
+    It reads the index alone, as many entries as there are changes.
+    """
+    c = keyframe_changes.c
+    query = select(func.coalesce(func.max(c.id), 0), func.count(), func.coalesce(func.sum(c.id), 0))
+    query = query.where(c.map_id == map_id, c.id > change_id)
+    newest, rows, total = retry.read(engine, lambda connection: connection.execute(query).one())
+    return ChangeMark(int(newest), int(rows), int(total))
