@@ -197,6 +197,7 @@ class Localization:
     keyframes_matched: int
     reason: str  # one line for people: why this verdict
     timing_ms: Mapping[str, float]
+    evidence: Mapping[str, float] = field(default_factory=dict)  # what verdict and confidence were made from
     # for plots: the best keyframe and its inlier pairs (pixels as seen)
     best_keyframe_id: int | None = None
     query_xy: Float32Array | None = None  # [m, 2]

@@ -13,6 +13,7 @@ from semdb.database.planning import check_models
 from semdb.errors import NotFoundError
 from semdb.geometry import pose_distances
 from semdb.localization.coarse import Batch, CoarseOptions, CoarseSource, Proposal, Scored, Stage, cascade
+from semdb.localization.confidence import Evidence, gather_evidence
 from semdb.localization.keyframe_cache import KeyframeCache
 from semdb.localization.matching import Matches
 from semdb.localization.pose import PoseEstimate, PoseOptions, estimate_pose, match_view, rival_pose
@@ -138,9 +139,10 @@ class Localizer:
         rival = 0
         if search.estimate is not None:
             rival = rival_pose(search.query, search.keyframes, search.matches, search.estimate, self.options.pose)
-        judgement = judge(search.estimate, rival, self.options.verdict)
+        evidence = None if search.estimate is None else _evidence(search, search.estimate, rival)
+        judgement = judge(evidence, self.options.verdict)
         search.timing_ms["pose"] += _ms_since(started)
-        return self._result(search, judgement)
+        return self._result(search, judgement, evidence)
 
     def _ask_neighbours(self, search: _Search) -> None:
         """Keyframes near the first pose see the same things from elsewhere: their pairs steady the pose."""
@@ -185,7 +187,7 @@ class Localizer:
             search.proposals += chosen
             self._match(search, [proposal.keyframe_id for proposal in chosen])
 
-    def _result(self, search: _Search, judgement: Judgement) -> Localization:
+    def _result(self, search: _Search, judgement: Judgement, evidence: Evidence | None) -> Localization:
         estimate = search.estimate if judgement.verdict is not Verdict.FAILED else None
         inliers = dict.fromkeys((keyframe.keyframe_id for keyframe in search.keyframes), 0)
         if estimate is not None:
@@ -206,6 +208,7 @@ class Localizer:
             keyframes_matched=len(search.keyframes),
             reason=judgement.reason,
             timing_ms=search.timing_ms,
+            evidence={} if evidence is None else evidence.as_mapping(),
             best_keyframe_id=best,
             query_xy=query_xy,
             keyframe_xy=keyframe_xy,
@@ -247,6 +250,12 @@ class _TimedSource:
         found = self._source.filtered(query, minimum_share, at_most)
         self.filter_ms += _ms_since(started)
         return found
+
+
+def _evidence(search: _Search, estimate: PoseEstimate, rival: int) -> Evidence:
+    cosines = {proposal.keyframe_id: proposal.cosine for proposal in search.proposals}
+    known = [cosines[keyframe.keyframe_id] for keyframe in search.keyframes]
+    return gather_evidence(search.query, search.keyframes, estimate, rival, known)
 
 
 def _class_counts(description: Description) -> dict[str, float]:

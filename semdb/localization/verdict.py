@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from semdb.localization.confidence import Evidence, confidence_of
 from semdb.localization.pose import PoseEstimate
 from semdb.types import Verdict
 
@@ -46,22 +47,6 @@ class Judgement:
     reason: str
 
 
-def position_sigma(estimate: PoseEstimate) -> tuple[float, float]:
-    """Standard deviation of position (m) and rotation (deg) along the worst axis; infinite without covariance."""
-    if estimate.covariance is None:
-        return float("inf"), float("inf")
-    position = float(np.sqrt(max(np.linalg.eigvalsh(estimate.covariance[:3, :3])[-1], 0.0)))
-    rotation = float(np.sqrt(max(np.linalg.eigvalsh(estimate.covariance[3:, 3:])[-1], 0.0)))
-    return position, float(np.degrees(rotation))
-
-
-def confidence_of(estimate: PoseEstimate, rival_inliers: int) -> float:
-    """Confidence 0..1: a logistic function of inliers, their spread and the best rival's inliers."""
-    support = np.log(max(estimate.inliers, 1)) - np.log(max(rival_inliers, 6)) / 3
-    score = 3.0 * (support - 2.1) + 4.0 * (estimate.spread - 0.25)
-    return float(1 / (1 + np.exp(-score)))
-
-
 def convinces(estimate: PoseEstimate | None, options: VerdictOptions) -> bool:
     """Whether a pose is so well supported that no further keyframe need be asked."""
     return (
@@ -72,46 +57,45 @@ def convinces(estimate: PoseEstimate | None, options: VerdictOptions) -> bool:
     )
 
 
-def _is_plausible(estimate: PoseEstimate, options: VerdictOptions) -> bool:
+def _is_plausible(evidence: Evidence, options: VerdictOptions) -> bool:
     """Whether more agrees than does for images of quite another place."""
     by_best = (
-        estimate.first_of_best >= options.ambiguous_first_of_best and estimate.agreement >= options.ambiguous_agreement
+        evidence.first_of_best >= options.ambiguous_first_of_best and evidence.agreement >= options.ambiguous_agreement
     )
-    return estimate.inliers >= options.ambiguous_inliers and (
-        by_best or estimate.first_inliers >= options.ambiguous_first_inliers or estimate.inliers >= options.many_inliers
+    return evidence.inliers >= options.ambiguous_inliers and (
+        by_best or evidence.first_inliers >= options.ambiguous_first_inliers or evidence.inliers >= options.many_inliers
     )
 
 
-def _first_support_is_enough(estimate: PoseEstimate, options: VerdictOptions) -> bool:
-    few = estimate.first_inliers >= options.few_first_inliers and estimate.agreement >= options.agreement_of_few
-    many = estimate.first_inliers >= options.many_first_inliers or estimate.inliers >= options.many_inliers
+def _first_support_is_enough(evidence: Evidence, options: VerdictOptions) -> bool:
+    few = evidence.first_inliers >= options.few_first_inliers and evidence.agreement >= options.agreement_of_few
+    many = evidence.first_inliers >= options.many_first_inliers or evidence.inliers >= options.many_inliers
     return few or many
 
 
-def judge(estimate: PoseEstimate | None, rival_inliers: int, options: VerdictOptions) -> Judgement:
-    """The verdict on a pose whose best rival elsewhere has `rival_inliers` (0: none was found)."""
-    if estimate is None or not _is_plausible(estimate, options):
-        count = 0 if estimate is None else estimate.first_inliers
+def judge(evidence: Evidence | None, options: VerdictOptions) -> Judgement:
+    """The verdict on a pose with this evidence, None where there is no pose."""
+    if evidence is None or not _is_plausible(evidence, options):
+        count = 0 if evidence is None else evidence.first_inliers
         return Judgement(Verdict.FAILED, 0.0, f"no more keypoints agree on a pose than may by chance: {count}")
-    confidence = confidence_of(estimate, rival_inliers)
-    position, rotation = position_sigma(estimate)
+    confidence = confidence_of(evidence)
     doubts = []
-    if estimate.inliers < options.localized_inliers:
-        doubts.append(f"only {estimate.inliers} keypoints agree")
-    if not _first_support_is_enough(estimate, options):
+    if evidence.inliers < options.localized_inliers:
+        doubts.append(f"only {evidence.inliers} keypoints agree")
+    if not _first_support_is_enough(evidence, options):
         doubts.append(
-            f"without the pose as a guide only {estimate.first_inliers} pairs agree, "
-            f"{estimate.agreement:.0%} of those with the best keyframe"
+            f"without the pose as a guide only {evidence.first_inliers} pairs agree, "
+            f"{evidence.agreement:.0%} of those with the best keyframe"
         )
-    if estimate.spread < options.minimum_spread:
+    if evidence.spread < options.minimum_spread:
         doubts.append("they cover a small part of the image")
-    if estimate.covariance is not None and position > options.maximum_translation_sigma_m:
-        doubts.append(f"the position is uncertain by {position:.2f} m")
-    if estimate.covariance is not None and rotation > options.maximum_rotation_sigma_deg:
-        doubts.append(f"the rotation is uncertain by {rotation:.1f} deg")
+    if np.isfinite(evidence.sigma_m) and evidence.sigma_m > options.maximum_translation_sigma_m:
+        doubts.append(f"the position is uncertain by {evidence.sigma_m:.2f} m")
+    if np.isfinite(evidence.sigma_deg) and evidence.sigma_deg > options.maximum_rotation_sigma_deg:
+        doubts.append(f"the rotation is uncertain by {evidence.sigma_deg:.1f} deg")
     # like with like: nothing that a pose has guided, and one keyframe, since of a place elsewhere one was asked
-    if rival_inliers > options.rival_share * estimate.first_of_best:
-        doubts.append(f"a pose elsewhere has {rival_inliers} against {estimate.first_of_best} inliers")
+    if evidence.rival > options.rival_share * evidence.first_of_best:
+        doubts.append(f"a pose elsewhere has {evidence.rival} against {evidence.first_of_best} inliers")
     if doubts:
         return Judgement(Verdict.AMBIGUOUS, min(confidence, 0.5), "; ".join(doubts))
-    return Judgement(Verdict.LOCALIZED, confidence, f"{estimate.inliers} keypoints agree")
+    return Judgement(Verdict.LOCALIZED, confidence, f"{evidence.inliers} keypoints agree")

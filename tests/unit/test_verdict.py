@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from semdb.localization.confidence import Evidence, confidence_of, sigmas
 from semdb.localization.pose import Pairs, PoseEstimate
-from semdb.localization.verdict import VerdictOptions, confidence_of, convinces, judge, position_sigma
+from semdb.localization.verdict import VerdictOptions, convinces, judge
 from semdb.types import Verdict
 
 OPTIONS = VerdictOptions()
@@ -25,65 +26,84 @@ GOOD = PoseEstimate(
     residual_px=0.8,
     spread=0.6,
 )
+EVIDENCE = Evidence(
+    inliers=120,
+    first_inliers=80,
+    first_of_best=80,
+    agreement=0.7,
+    spread=0.6,
+    residual_px=0.8,
+    sigma_m=0.001,
+    sigma_deg=0.06,
+    rival=0,
+    supporters=2,
+    second=40,
+    explained=0.4,
+    coverage=0.9,
+    classes=0.8,
+    class_points=100,
+    cosine=0.95,
+    cosine_gap=0.1,
+)
 
 
 def test_a_well_supported_pose_is_localized_and_ends_the_search() -> None:
-    found = judge(GOOD, 0, OPTIONS)
+    found = judge(EVIDENCE, OPTIONS)
     assert found.verdict is Verdict.LOCALIZED
     assert found.confidence > 0.99
     assert convinces(GOOD, OPTIONS)
 
 
 def test_no_pose_or_next_to_none_is_failed() -> None:
-    for estimate in (None, replace(GOOD, inliers=7)):
-        found = judge(estimate, 0, OPTIONS)
+    for evidence in (None, replace(EVIDENCE, inliers=7)):
+        found = judge(evidence, OPTIONS)
         assert (found.verdict, found.confidence) == (Verdict.FAILED, 0.0)
+    for estimate in (None, replace(GOOD, inliers=7)):
         assert not convinces(estimate, OPTIONS)
 
 
 @pytest.mark.parametrize(
-    ("changes", "rival", "words"),
+    ("changes", "words"),
     [
-        ({"inliers": 19}, 0, "only 19 keypoints"),
-        ({"inliers": 80, "first_inliers": 9, "agreement": 0.9}, 0, "without the pose as a guide only 9"),
-        ({"inliers": 80, "first_inliers": 24, "agreement": 0.3}, 0, "30%"),
-        ({"spread": 0.125}, 0, "small part"),
-        ({"covariance": np.diag([1e-2, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6])}, 0, "0.10 m"),
-        ({"covariance": np.diag([1e-6] * 5 + [np.radians(3) ** 2])}, 0, "3.0 deg"),
-        ({}, 60, "elsewhere has 60 against 80"),
+        ({"inliers": 19}, "only 19 keypoints"),
+        ({"inliers": 80, "first_inliers": 9, "agreement": 0.9}, "without the pose as a guide only 9"),
+        ({"inliers": 80, "first_inliers": 24, "agreement": 0.3}, "30%"),
+        ({"spread": 0.125}, "small part"),
+        ({"sigma_m": 0.1}, "0.10 m"),
+        ({"sigma_deg": 3.0}, "3.0 deg"),
+        ({"rival": 60}, "elsewhere has 60 against 80"),
     ],
 )
-def test_every_doubt_makes_it_ambiguous_and_is_named(changes: dict[str, object], rival: int, words: str) -> None:
-    found = judge(replace(GOOD, **changes), rival, OPTIONS)
+def test_every_doubt_makes_it_ambiguous_and_is_named(changes: dict[str, float], words: str) -> None:
+    found = judge(replace(EVIDENCE, **changes), OPTIONS)
     assert found.verdict is Verdict.AMBIGUOUS
     assert words in found.reason
     assert found.confidence <= 0.5
 
 
 def test_few_pairs_that_agree_well_are_enough() -> None:
-    assert judge(replace(GOOD, first_inliers=10, agreement=0.36), 0, OPTIONS).verdict is Verdict.LOCALIZED
+    assert judge(replace(EVIDENCE, first_inliers=10, agreement=0.36), OPTIONS).verdict is Verdict.LOCALIZED
 
 
 def test_very_many_inliers_are_enough_however_few_agreed_at_first() -> None:
-    guided = replace(GOOD, inliers=129, first_inliers=14, first_of_best=6, agreement=0.15)
-    assert judge(guided, 0, OPTIONS).verdict is Verdict.LOCALIZED
-    assert judge(replace(guided, inliers=60), 0, OPTIONS).verdict is Verdict.FAILED
+    guided = replace(EVIDENCE, inliers=129, first_inliers=14, first_of_best=6, agreement=0.15)
+    assert judge(guided, OPTIONS).verdict is Verdict.LOCALIZED
+    assert judge(replace(guided, inliers=60), OPTIONS).verdict is Verdict.FAILED
 
 
 def test_a_wrong_pose_fed_by_guided_matches_is_failed() -> None:
     """30 guided inliers, 12 of 70 before: seen on a real recording, 1.3 m off."""
-    wrong = replace(GOOD, inliers=30, first_inliers=12, first_of_best=12, agreement=12 / 70, spread=0.4)
-    found = judge(wrong, 0, OPTIONS)
+    wrong = replace(EVIDENCE, inliers=30, first_inliers=12, first_of_best=12, agreement=12 / 70, spread=0.4)
+    found = judge(wrong, OPTIONS)
     assert (found.verdict, found.confidence) == (Verdict.FAILED, 0.0)
-    assert not convinces(wrong, OPTIONS)
     for doubtful in ({"agreement": 0.25}, {"first_inliers": 17}):
-        assert judge(replace(wrong, **doubtful), 0, OPTIONS).verdict is Verdict.AMBIGUOUS
+        assert judge(replace(wrong, **doubtful), OPTIONS).verdict is Verdict.AMBIGUOUS
 
 
 def test_confidence_grows_with_support_and_falls_with_a_rival() -> None:
-    values = [confidence_of(replace(GOOD, inliers=count), 0) for count in (10, 20, 40, 80)]
+    values = [confidence_of(replace(EVIDENCE, inliers=count)) for count in (10, 20, 40, 80)]
     assert values == sorted(values)
-    assert confidence_of(GOOD, 60) < confidence_of(GOOD, 0)
+    assert confidence_of(replace(EVIDENCE, rival=60)) < confidence_of(EVIDENCE)
     assert 0 <= min(values) <= max(values) <= 1
 
 
@@ -92,7 +112,7 @@ def test_sigma_is_that_of_the_worst_axis() -> None:
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = turn @ np.diag([1e-4, 4e-4, 9e-4]) @ turn.T
     covariance[3:, 3:] = turn @ np.diag([1e-6, 1e-6, 4e-6]) @ turn.T
-    metres, degrees = position_sigma(replace(GOOD, covariance=covariance))
+    metres, degrees = sigmas(covariance)
     assert metres == pytest.approx(0.03)
     assert degrees == pytest.approx(np.degrees(0.002))
-    assert position_sigma(replace(GOOD, covariance=None)) == (float("inf"), float("inf"))
+    assert sigmas(None) == (float("inf"), float("inf"))

@@ -1,0 +1,157 @@
+"""What speaks for a pose and what against it, as numbers; and from them the probability that the pose is right."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from semdb.geometry import invert_pose, project, transform_points
+from semdb.localization.pose import PoseEstimate
+from semdb.localization.views import KeyframeView, View
+from semdb.types import BoolArray, Float32Array, FloatArray, IntArray
+
+GRID = 4  # cells along each side of the image
+CELL_POINTS = 4  # so many points of keyframes must fall into a cell before it counts as one they show
+SUPPORTER_PAIRS = 6  # a keyframe with fewer inliers says nothing of its own
+NEAR_PX = 12.0  # a projected point and a keypoint this near are on the same thing
+LEAST_OBJECT_POINTS = 12  # fewer points on objects say nothing about classes
+NEUTRAL_CLASSES = 0.5  # agreement of classes where there is nothing to compare
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """Numbers about one pose. All but the counts, pixels, metres and degrees are shares from 0 to 1."""
+
+    inliers: int  # distinct keypoints of the query that agree in the end
+    first_inliers: int  # pairs that agreed before any was guided, of all keyframes
+    first_of_best: int  # those with the keyframe that had most
+    agreement: float  # their share of the pairs with that keyframe
+    spread: float  # cells of a 4x4 grid over the image that hold inliers
+    residual_px: float  # median
+    sigma_m: float  # standard deviation of the position along its worst axis
+    sigma_deg: float  # the same of the rotation
+    rival: int  # first inliers of the best pose elsewhere
+    supporters: int  # keyframes with at least six inlier pairs
+    second: int  # inlier pairs of the second best keyframe
+    explained: float  # of the keyframes' points that should be seen, those that are inliers
+    coverage: float  # of the cells in which keyframes' points should be seen, those that hold inliers
+    classes: float  # of the objects' points that should be seen, those that lie on an object of their class
+    class_points: int  # how many could be compared
+    cosine: float  # of the best keyframe's CNN vector with the query's; NaN where it is not known
+    cosine_gap: float  # that, less the best cosine of a keyframe that does not support the pose
+
+    def as_mapping(self) -> dict[str, float]:
+        """Name to number, for results and files."""
+        return {name: float(value) for name, value in asdict(self).items()}
+
+
+def sigmas(covariance: FloatArray | None) -> tuple[float, float]:
+    """Standard deviation of position (m) and rotation (deg) along the worst axis; infinite without covariance."""
+    if covariance is None:
+        return float("inf"), float("inf")
+    position = float(np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0)))
+    rotation = float(np.sqrt(max(np.linalg.eigvalsh(covariance[3:, 3:])[-1], 0.0)))
+    return position, float(np.degrees(rotation))
+
+
+def gather_evidence(
+    query: View,
+    keyframes: Sequence[KeyframeView],
+    estimate: PoseEstimate,
+    rival_inliers: int,
+    cosines: Sequence[float],
+) -> Evidence:
+    """The evidence on `estimate`. `cosines` are those of `keyframes` (NaN where unknown).
+
+    Keyframes that were matched after the estimate was made (to look for a twin of the place) do not support it.
+    """
+    pairs = np.array([*estimate.per_keyframe, *[0] * (len(keyframes) - len(estimate.per_keyframe))], int)
+    order = np.argsort(-pairs, kind="stable")
+    supporters = [int(n) for n in order if pairs[n] >= SUPPORTER_PAIRS] or [int(order[0])]
+    explained, coverage, classes, class_points = _what_should_be_seen(query, keyframes, estimate, supporters)
+    known = np.asarray(cosines, float)
+    best = known[supporters]
+    others = np.delete(known, supporters)
+    cosine = float(np.nanmax(best)) if np.isfinite(best).any() else float("nan")
+    gap = cosine - float(np.nanmax(others)) if np.isfinite(others).any() else float("nan")
+    sigma_m, sigma_deg = sigmas(estimate.covariance)
+    return Evidence(
+        inliers=estimate.inliers,
+        first_inliers=estimate.first_inliers,
+        first_of_best=estimate.first_of_best,
+        agreement=estimate.agreement,
+        spread=estimate.spread,
+        residual_px=estimate.residual_px,
+        sigma_m=sigma_m,
+        sigma_deg=sigma_deg,
+        rival=rival_inliers,
+        supporters=int((pairs >= SUPPORTER_PAIRS).sum()),
+        second=int(pairs[order[1]]) if len(pairs) > 1 else 0,
+        explained=explained,
+        coverage=coverage,
+        classes=classes,
+        class_points=class_points,
+        cosine=cosine,
+        cosine_gap=gap,
+    )
+
+
+def _what_should_be_seen(
+    query: View, keyframes: Sequence[KeyframeView], estimate: PoseEstimate, supporters: Sequence[int]
+) -> tuple[float, float, float, int]:
+    """`explained`, `coverage`, `classes` and `class_points` of `Evidence`: points of the keyframes in the query.
+
+    Under a right pose most of what the keyframes hold is there again; under a wrong one that a single repeated thing
+    supports, the rest is missing.
+    """
+    camera_from_world = invert_pose(estimate.world_from_camera)
+    size = np.array([query.camera.width, query.camera.height], float)
+    tree = cKDTree(query.seen_xy) if len(query) else None
+    seen = agreeing = 0
+    expected = np.zeros(GRID * GRID, int)
+    same = compared = 0
+    for slot in supporters:
+        keyframe = keyframes[slot]
+        local = transform_points(camera_from_world, keyframe.world_points)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            pixels = np.asarray(project(query.camera, local))
+        inside = (local[:, 2] > 0.1) & (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1)
+        seen += int(inside.sum())
+        agreeing += estimate.per_keyframe[slot]
+        cells = (pixels[inside] * GRID / size).astype(int)
+        expected += np.bincount(cells[:, 1] * GRID + cells[:, 0], minlength=GRID * GRID)
+        if tree is not None and (query.classes >= 0).any():
+            counted, equal = _classes_agree(query, tree, pixels[inside], keyframe.view.classes[inside])
+            compared += counted
+            same += equal
+    held = _cells_of(query.seen_xy[estimate.pairs.query], size)
+    shown = expected >= CELL_POINTS
+    classes = same / compared if compared >= LEAST_OBJECT_POINTS else NEUTRAL_CLASSES
+    return min(agreeing / max(seen, 1), 1.0), float((shown & held).sum() / max(shown.sum(), 1)), classes, compared
+
+
+def _cells_of(pixels: Float32Array, size: FloatArray) -> BoolArray:
+    """Which cells ``[16]`` of the grid hold a pixel."""
+    cells = np.clip((pixels * GRID / size).astype(int), 0, GRID - 1)
+    held = np.zeros(GRID * GRID, np.bool_)
+    held[cells[:, 1] * GRID + cells[:, 0]] = True
+    return held
+
+
+def _classes_agree(query: View, tree: cKDTree, pixels: FloatArray, classes: IntArray) -> tuple[int, int]:
+    """Of projected points next to a keypoint of the query, where either lies on an object: how many, of equal class."""
+    distance, nearest = tree.query(pixels, distance_upper_bound=NEAR_PX)
+    near = np.isfinite(distance)
+    theirs, ours = classes[near], query.classes[np.asarray(nearest)[near]]
+    counts = (theirs >= 0) | (ours >= 0)
+    return int(counts.sum()), int((counts & (theirs == ours)).sum())
+
+
+def confidence_of(evidence: Evidence) -> float:
+    """Confidence 0..1: a logistic function of inliers, their spread and the best rival's inliers."""
+    support = np.log(max(evidence.inliers, 1)) - np.log(max(evidence.rival, 6)) / 3
+    score = 3.0 * (support - 2.1) + 4.0 * (evidence.spread - 0.25)
+    return float(1 / (1 + np.exp(-score)))
