@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from sqlalchemy import Connection, Engine, func, insert, select
+from sqlalchemy import Connection, Engine, FromClause, func, insert, select
 
 from semdb.database import retry
 from semdb.database.records import RecordingState, RecordingStatus
@@ -36,13 +36,17 @@ def status(engine: Engine, map_id: int | None = None) -> list[RecordingStatus]:
         rows = list(connection.execute(query))
         items: dict[int, dict[str, int]] = {}
         i = ingest_items.c
-        by_state = select(i.recording_id, i.state, func.count()).group_by(i.recording_id, i.state)
-        for recording_id, state, count in connection.execute(by_state.order_by(i.recording_id, i.state)):
+        # In the order of an index that holds all three.
+        by_state = select(i.recording_id, i.state, func.count()).group_by(i.state, i.recording_id)
+        if map_id is not None:
+            by_state = by_state.join(recordings, r.id == i.recording_id).where(r.map_id == map_id)
+        for recording_id, state, count in sorted(tuple(row) for row in connection.execute(by_state)):
             items.setdefault(recording_id, {})[state] = count
-        frames = _sums(connection, func.count(keyframes.c.id))
-        boxes = _sums(connection, func.count(objects.c.id), objects)
-        points = _sums(connection, func.sum(keypoints.c.count), keypoints)
-        size = _sums(connection, func.sum(keyframe_images.c.rgb_bytes + keyframe_images.c.depth_bytes), keyframe_images)
+        image_bytes = func.sum(keyframe_images.c.rgb_bytes + keyframe_images.c.depth_bytes)
+        frames = _sums(connection, map_id, func.count(keyframes.c.id))
+        boxes = _sums(connection, map_id, func.count(objects.c.id), objects)
+        points = _sums(connection, map_id, func.sum(keypoints.c.count), keypoints)
+        size = _sums(connection, map_id, image_bytes, keyframe_images)
         return [
             RecordingStatus(
                 *row[:6],
@@ -60,11 +64,21 @@ def status(engine: Engine, map_id: int | None = None) -> list[RecordingStatus]:
     return retry.read(engine, work)
 
 
-def _sums(connection: Connection, value: Any, table: Any = None) -> dict[int, int]:
-    """`value` over the keyframes of each recording, joined with `table` by keyframe_id."""
-    source = keyframes if table is None else keyframes.join(table, table.c.keyframe_id == keyframes.c.id)
-    query = select(keyframes.c.recording_id, value).select_from(source).group_by(keyframes.c.recording_id)
-    return {recording_id: int(number or 0) for recording_id, number in connection.execute(query)}
+def _sums(connection: Connection, map_id: int | None, value: Any, table: Any = None) -> dict[int, int]:
+    """`value` over the keyframes of each recording of a map (None: of all), joined with `table` by keyframe_id."""
+    source: FromClause = keyframes
+    recording_id = keyframes.c.recording_id
+    if map_id is not None:
+        source = recordings.join(keyframes, keyframes.c.recording_id == recordings.c.id)
+        recording_id = recordings.c.id
+    if table is not None:
+        source = source.join(table, table.c.keyframe_id == keyframes.c.id)
+    query = select(recording_id, value).select_from(source).group_by(recording_id)
+    if map_id is not None:
+        query = query.where(recordings.c.map_id == map_id)
+    # From the keyframes to what belongs to them: the other way round a server reads a table of blobs from end to end.
+    query = query.prefix_with("STRAIGHT_JOIN", dialect="mysql")
+    return {key: int(number or 0) for key, number in connection.execute(query)}
 
 
 def log_query(engine: Engine, map_id: int, image: str, localization: Localization) -> int:

@@ -208,6 +208,7 @@ ingest_items = _table(
     Column("worker", String(NAME_LENGTH)),
     Column("lease_until", DateTime),
     Index(None, "state", "lease_until"),
+    Index(None, "state", "recording_id", "frame_index"),
 )
 
 keyframe_changes = _table(
