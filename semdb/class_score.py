@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from semdb.errors import UsageError
 
 SCALE = 1_000_000
-LARGEST = 2**31 - 1  # of the weights of a query together: an index adds them in 32 bits
+MOST_OBJECTS = 255  # of a class that make a difference: an index keeps their number in 8 bits
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,8 +33,8 @@ class ClassTerm:
 class ClassQuery:
     """A query by classes: a keyframe's class score is the sum of its terms over `total`.
 
-    A class comes in one term only. Raises UsageError for terms that contradict this, or are not positive, or exceed
-    what fits into 32 bits.
+    A class comes in one term only. Raises UsageError for terms that contradict this or are not positive or ask for
+    more than `MOST_OBJECTS`.
     """
 
     terms: tuple[ClassTerm, ...]
@@ -45,8 +45,10 @@ class ClassQuery:
             raise UsageError("a class comes twice in a query: its terms have to be one")
         if any(term.per_object <= 0 or term.full <= 0 for term in self.terms):
             raise UsageError("the weights of the classes of a query are positive")
-        if (self.terms and self.total <= 0) or sum(term.full for term in self.terms) > LARGEST:
-            raise UsageError(f"the classes of a query weigh 1 to {LARGEST} millionths together")
+        if any(term.full > MOST_OBJECTS * term.per_object for term in self.terms):
+            raise UsageError(f"more than {MOST_OBJECTS} objects of one class cannot be asked for")
+        if self.terms and self.total <= 0:
+            raise UsageError("the total of a query is positive")
 
     def least(self, minimum_share: float) -> int:
         """The smallest sum that passes `minimum_share`; a keyframe that shares nothing never does."""
@@ -74,4 +76,5 @@ def class_query(counts: Mapping[str, float], keyframes: int, document_frequency:
 def class_term(category: str, wanted: float, keyframes: int, document_frequency: int) -> ClassTerm:
     """The term of a class of which the query shows `wanted` objects, by the formula above."""
     per_object = round(SCALE * (math.log((1 + keyframes) / (1 + document_frequency)) + 1))
-    return ClassTerm(category, per_object, round(per_object * wanted))  # so that n >= wanted objects give `full`
+    # rounded in this order n >= wanted objects give exactly `full`
+    return ClassTerm(category, per_object, round(per_object * min(wanted, MOST_OBJECTS)))

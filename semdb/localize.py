@@ -11,9 +11,10 @@ from semdb.database.planning import check_models
 from semdb.database.records import MapInfo
 from semdb.database.store import Store
 from semdb.errors import DatabaseError, FrameError, NotFoundError, ProvenanceError, UsageError
+from semdb.localization.index import IndexOptions, IndexSource, MapIndex
 from semdb.localization.keyframe_cache import KeyframeCache
 from semdb.localization.localizer import Localizer, LocalizerOptions
-from semdb.localization.sources import MemorySource, SqlSource
+from semdb.localization.sources import SqlSource
 from semdb.model_choice import settings_of_map, specs_for_query
 from semdb.perception.describe import Describer, describer_from_specs
 from semdb.query_image import LikeCamera, QueryImage, QueryReader
@@ -57,11 +58,32 @@ def check_coarse(coarse: str) -> None:
         raise UsageError(f"--coarse {coarse}: known are sql and index")
 
 
-def make_localizer(store: Store, info: MapInfo, coarse: str, options: LocalizerOptions | None = None) -> Localizer:
-    """The localizer of one map. Raises UsageError for a `coarse` that is neither ``sql`` nor ``index``."""
+def make_localizer(
+    store: Store,
+    info: MapInfo,
+    coarse: str,
+    options: LocalizerOptions | None = None,
+    *,
+    settings: Settings | None = None,
+    say: Callable[[str], None] | None = None,
+) -> Localizer:
+    """The localizer of one map. Raises UsageError for a `coarse` that is neither ``sql`` nor ``index``.
+
+    With `settings` an index is kept in their cache folder; without, it lives in memory alone.
+    """
     check_coarse(coarse)
-    source = SqlSource(store, info.id) if coarse == "sql" else MemorySource(store, info.id)
+    source = SqlSource(store, info.id) if coarse == "sql" else IndexSource(open_index(store, info.id, settings, say))
     return Localizer(info.name, store.map_models(info.id), source, KeyframeCache(store, info.id), options)
+
+
+def open_index(
+    store: Store, map_id: int, settings: Settings | None = None, say: Callable[[str], None] | None = None
+) -> MapIndex:
+    """The index of a map as the settings have it."""
+    if settings is None:
+        return MapIndex.open(store, map_id, say=say)
+    options = IndexOptions(exact_up_to=settings.index_exact_up_to, threads=settings.threads)
+    return MapIndex.open(store, map_id, settings.cache_dir, options=options, say=say)
 
 
 def localize_images(
@@ -129,7 +151,7 @@ def _open_maps(
     opened, refused = [], []
     for info in infos:
         try:
-            opened.append(_open_map(store, info, settings, options, describers))
+            opened.append(_open_map(store, info, settings, options, describers, say))
         except (ProvenanceError, UsageError) as error:
             if len(infos) == 1:
                 raise
@@ -142,7 +164,12 @@ def _open_maps(
 
 
 def _open_map(
-    store: Store, info: MapInfo, settings: Settings, options: LocalizeOptions, describers: dict[object, Describer]
+    store: Store,
+    info: MapInfo,
+    settings: Settings,
+    options: LocalizeOptions,
+    describers: dict[object, Describer],
+    say: Callable[[str], None] | None,
 ) -> _MapLocalizer:
     models = store.map_models(info.id)
     specs = specs_for_query(settings, models)
@@ -151,7 +178,8 @@ def _open_map(
     if key not in describers:
         describers[key] = describer_from_specs(specs.detector, specs.encoder, specs.features, own)
     check_models(models, describers[key].models, f"the map {info.name!r}")
-    return _MapLocalizer(info, describers[key], make_localizer(store, info, options.coarse, options.localizer))
+    localizer = make_localizer(store, info, options.coarse, options.localizer, settings=settings, say=say)
+    return _MapLocalizer(info, describers[key], localizer)
 
 
 def _ask(maps: Sequence[_MapLocalizer], query: QueryImage) -> tuple[Description, Localization]:

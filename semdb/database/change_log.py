@@ -36,3 +36,11 @@ def change_mark(engine: Engine, map_id: int, change_id: int) -> ChangeMark:
     query = query.where(c.map_id == map_id, c.id > change_id)
     newest, rows, total = retry.read(engine, lambda connection: connection.execute(query).one())
     return ChangeMark(int(newest), int(rows), int(total))
+
+
+def change_text(engine: Engine, map_id: int, change_id: int) -> str | None:
+    """All that the log says in one row, to tell whether it is still the same log; None where there is no such row."""
+    c = keyframe_changes.c
+    query = select(c.keyframe_id, c.kind, c.changed_at).where(c.map_id == map_id, c.id == change_id)
+    row = retry.read(engine, lambda connection: connection.execute(query).one_or_none())
+    return None if row is None else f"{row.keyframe_id} {row.kind} {row.changed_at}"

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from sqlalchemy import Connection, Engine, select
+from sqlalchemy import Connection, Engine, case, func, select
 
 from semdb.database import retry
 from semdb.database.codecs import decode_vectors
 from semdb.database.reading import keyframe_ids
-from semdb.database.tables import cnn_vectors
+from semdb.database.tables import categories, cnn_vectors, keyframe_categories, keyframes, maps, recordings
 from semdb.types import Float32Array, Int64Array
 
 IN_CHUNK = 500
+FETCH = 20_000  # rows of two numbers at a time
 DENSE = 0.5  # of the ids of a range that are wanted: from here on the range is read, not a list of ids
 
 
@@ -30,7 +32,93 @@ def iter_vectors(engine: Engine, map_id: int, chunk: int = 2000) -> Iterator[tup
 def vectors_there(engine: Engine, ids: Int64Array) -> tuple[Int64Array, Float32Array]:
     """Vectors float32 ``[n, d]`` of those of `ids` that are there, and their ids, ascending. Raises CodecError."""
     wanted = np.unique(ids)
-    rows = retry.read(engine, lambda connection: _rows(connection, wanted))
+    return _decoded(retry.read(engine, lambda connection: _rows(connection, wanted)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CoarseRows:
+    """What the coarse step needs of some keyframes."""
+
+    ids: Int64Array  # [n] ascending
+    vectors: Float32Array  # [n, d]
+    objects: tuple[tuple[int, str, int], ...]  # keyframe, class, number of objects
+
+
+def coarse_rows(engine: Engine, ids: Int64Array) -> CoarseRows:
+    """What is there of these keyframes, as of one moment. Raises CodecError."""
+    wanted = np.unique(ids)
+
+    def work(connection: Connection) -> tuple[list[tuple[int, bytes]], list[tuple[int, str, int]]]:
+        c = keyframe_categories.c
+        query = select(c.keyframe_id, categories.c.name, c.count).join(categories, categories.c.id == c.category_id)
+        shown = [
+            (int(row[0]), str(row[1]), int(row[2]))
+            for keys in _in_chunks(wanted.tolist())
+            for row in connection.execute(query.where(c.keyframe_id.in_(keys)))
+        ]
+        return _rows(connection, wanted), shown
+
+    rows, shown = retry.read(engine, work)
+    found, vectors = _decoded(rows)
+    there = set(found.tolist())
+    return CoarseRows(found, vectors, tuple(item for item in shown if item[0] in there))
+
+
+def map_categories(engine: Engine, map_id: int) -> list[tuple[int, str]]:
+    """Ids and names of the classes that keyframes of a map show, by id."""
+    c = keyframe_categories.c
+    shown = select(c.keyframe_id).where(c.map_id == map_id, c.category_id == categories.c.id).exists()
+    query = select(categories.c.id, categories.c.name).where(shown).order_by(categories.c.id)
+    return retry.read(engine, lambda connection: [(int(key), str(name)) for key, name in connection.execute(query)])
+
+
+def category_column(engine: Engine, map_id: int, category_id: int) -> tuple[Int64Array, Int64Array]:
+    """Keyframes of a map that show a class ``[n]``, and how many objects of it each shows ``[n]``."""
+    c = keyframe_categories.c
+    query = select(c.keyframe_id, c.count).where(c.map_id == map_id, c.category_id == category_id)
+
+    def work(connection: Connection) -> Int64Array:
+        rows = connection.execute(query.execution_options(yield_per=FETCH))
+        pieces = [np.array([tuple(row) for row in piece], np.int64) for piece in rows.partitions()]
+        return np.concatenate([np.empty((0, 2), np.int64), *pieces])
+
+    table = retry.read(engine, work)
+    return table[:, 0], table[:, 1]
+
+
+@dataclass(frozen=True, slots=True)
+class MapSums:
+    """Sums over the rows of a map that a mirror of it must have too."""
+
+    keyframes: int
+    sum_of_ids: int
+    category_rows: int
+    objects: int
+
+
+def map_sums(engine: Engine, map_id: int, most_objects: int) -> MapSums:
+    """The sums over a map; more than `most_objects` of a class count as so many. Reads two indexes to the end."""
+    c = keyframe_categories.c
+    frames = select(func.count(), func.coalesce(func.sum(keyframes.c.id), 0))
+    frames = frames.select_from(keyframes.join(recordings)).where(recordings.c.map_id == map_id)
+    most = case((c.count > most_objects, most_objects), else_=c.count)
+    shown = select(func.count(), func.coalesce(func.sum(most), 0)).where(c.map_id == map_id)
+
+    def work(connection: Connection) -> MapSums:
+        numbers = [*connection.execute(frames).one(), *connection.execute(shown).one()]
+        return MapSums(*map(int, numbers))
+
+    return retry.read(engine, work)
+
+
+def map_identity(engine: Engine, map_id: int) -> str:
+    """A map's name and when it was made, to tell it from another one with the same id; empty where there is none."""
+    query = select(maps.c.name, maps.c.created_at).where(maps.c.id == map_id)
+    row = retry.read(engine, lambda connection: connection.execute(query).one_or_none())
+    return "" if row is None else f"{row.name} {row.created_at}"
+
+
+def _decoded(rows: list[tuple[int, bytes]]) -> tuple[Int64Array, Float32Array]:
     rows.sort(key=lambda row: row[0])
     found = np.array([row[0] for row in rows], np.int64)
     return found, decode_vectors([row[1] for row in rows], "cnn_vectors of keyframe", found)

@@ -1,46 +1,23 @@
-"""The mirror in memory against SQL, the reference, while the map changes; on both servers."""
+"""SQL, the reference of the coarse step, tells what changed; the log of changes is followed whatever happens to it."""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
+from sqlalchemy import delete, insert
 
+from semdb.database import retry
+from semdb.database.records import ChangeKind
 from semdb.database.store import Store
-from semdb.localization.coarse import CoarseOptions, CoarseSource, MapChange, cascade
-from semdb.localization.sources import MemorySource, SqlSource
-from tests.database_samples import CATEGORIES, description, fill
-
-QUERIES = 12
-
-
-def assert_equal_answers(memory: CoarseSource, sql: CoarseSource, seed: int) -> None:
-    random = np.random.default_rng(seed)
-    for _ in range(QUERIES):
-        names = random.choice([*CATEGORIES, "zebra"], size=int(random.integers(0, 5)))
-        counts = {str(name): float(random.integers(1, 4)) for name in names}
-        vector = description(int(random.integers(1000))).cnn_vector
-        options = CoarseOptions(filtered_at_most=4, filtered_batches=(2, 3), soft_batches=(3,), all_batches=(100,))
-        assert list(cascade(memory, counts, vector, options)) == list(cascade(sql, counts, vector, options))
+from semdb.database.tables import keyframe_changes
+from semdb.localization.changes import ChangeReader
+from semdb.localization.coarse import MapChange
+from semdb.localization.sources import SqlSource
+from tests.database_samples import description, fill
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_the_mirror_answers_as_sql_does_while_the_map_changes(store: Store, seed: int) -> None:
-    map_id, _, _ = fill(store, name="first", frame_indexes=range(0, 30, 2), seed=seed)
-    memory, sql = MemorySource(store, map_id), SqlSource(store, map_id)
-    sql.refresh()
-    assert_equal_answers(memory, sql, seed)
-    assert not memory.refresh()
-    fill(store, name="second", frame_indexes=range(7), seed=seed + 50)
-    assert memory.refresh()
-    sql.refresh()
-    assert memory.keyframe_count() == sql.keyframe_count() == 22
-    assert_equal_answers(memory, sql, seed + 1)
-    ids = store.keyframe_ids(map_id)
-    store.delete_keyframes(ids[3:9])
-    assert memory.refresh()
-    sql.refresh()
-    assert memory.keyframe_count() == sql.keyframe_count() == 16
-    assert_equal_answers(memory, sql, seed + 2)
+def note(store: Store, map_id: int, change_id: int, keyframe_id: int, kind: ChangeKind = ChangeKind.ADDED) -> None:
+    row = {"id": change_id, "map_id": map_id, "keyframe_id": keyframe_id, "kind": kind.value}
+    retry.write(store.engine, lambda connection: connection.execute(insert(keyframe_changes), row))
 
 
 def test_the_reference_tells_what_changed(store: Store) -> None:
@@ -52,3 +29,55 @@ def test_the_reference_tells_what_changed(store: Store) -> None:
     added = fill(store, name="second", frame_indexes=range(2))[2]
     assert sql.refresh() == MapChange(added=frozenset(added))
     assert sql.keyframe_count() == 6
+
+
+def test_cosines_of_the_reference(store: Store) -> None:
+    map_id, _, ids = fill(store, frame_indexes=range(6))
+    vector = description(99).cnn_vector
+    asked = np.array([ids[4], 10**6, ids[0], ids[4]], np.int64)
+    expected = store.load_vectors([ids[4], ids[0], ids[4]]).astype(np.float64) @ vector.astype(np.float64)
+    found = SqlSource(store, map_id).cosines(vector, asked)
+    assert np.isnan(found[1])
+    np.testing.assert_allclose(found[[0, 2, 3]], expected, atol=1e-12)
+    assert np.isnan(SqlSource(store, map_id).cosines(vector, np.array([10**6], np.int64))).all()
+
+
+def test_changes_that_commit_late_are_told_once(store: Store) -> None:
+    map_id = store.ensure_map("room")
+    reader = ChangeReader(store, map_id, overlap=50)
+    for change_id in (10, 11, 30):
+        note(store, map_id, change_id, change_id)
+    reader.skip()
+    assert reader.read() == []
+    note(store, map_id, 20, 20)  # its transaction began before that of 30
+    changes = reader.read()
+    assert changes is not None
+    assert [change.id for change in changes] == [20]
+    assert reader.read() == []
+    note(store, map_id, 90, 90)
+    note(store, map_id, 25, 25, ChangeKind.DELETED)
+    changes = reader.read()
+    assert changes is not None
+    assert [(change.id, change.kind) for change in changes] == [(25, ChangeKind.DELETED), (90, ChangeKind.ADDED)]
+    assert reader.read() == []
+
+
+def test_a_log_that_was_cut_off_is_noticed(store: Store) -> None:
+    map_id = store.ensure_map("room")
+    reader = ChangeReader(store, map_id)
+    for change_id in (10, 11):
+        note(store, map_id, change_id, change_id)
+    reader.skip()
+    below = delete(keyframe_changes).where(keyframe_changes.c.id < 11)
+    retry.write(store.engine, lambda connection: connection.execute(below))
+    assert reader.read() == []  # what was seen long ago may go
+    note(store, map_id, 12, 12)
+    note(store, map_id, 13, 13)
+    below = delete(keyframe_changes).where(keyframe_changes.c.id < 13)
+    retry.write(store.engine, lambda connection: connection.execute(below))
+    assert reader.read() is None
+    assert reader.read() == []
+    note(store, map_id, 14, 14)
+    changes = reader.read()
+    assert changes is not None
+    assert [change.id for change in changes] == [14]

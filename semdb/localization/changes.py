@@ -1,0 +1,70 @@
+"""Following the log of changes of a map, whoever writes it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+
+from semdb.database.records import Change, ChangeKind, ChangeMark
+from semdb.database.store import Store
+from semdb.localization.coarse import MapChange
+
+# Change ids commit out of order: how far behind the newest one a late one may still turn up.
+OVERLAP = 1000
+NOTHING = ChangeMark(0, 0, 0)
+
+
+class ChangeReader:
+    """Tells what the log of changes has that was not seen before, at the price of one small query when nothing has.
+
+    Ids commit out of order, so it looks again at the last `overlap` ids before the newest that it has seen.
+    """
+
+    def __init__(self, store: Store, map_id: int, overlap: int = OVERLAP) -> None:
+        self._store = store
+        self._map_id = map_id
+        self._overlap = overlap
+        self._mark = NOTHING
+        self.newest = 0
+        self.seen: frozenset[int] = frozenset()  # the last `overlap` of them
+
+    def restore(self, newest: int, seen: Collection[int]) -> None:
+        """Goes on from what another reader had seen."""
+        self.newest, self.seen, self._mark = newest, frozenset(seen), NOTHING
+
+    def skip(self) -> None:
+        """What the log holds now counts as seen."""
+        self.restore(self._store.change_mark(self._map_id, 0).newest, ())
+        self._note(self._store.changes_since(self._map_id, self._since()))
+
+    def read(self) -> list[Change] | None:
+        """Changes that were not seen before, ascending; each is told once.
+
+        None when the newest that was seen is not there any more: the log was cut off, or is another database's.
+        """
+        if self._store.change_mark(self._map_id, self._since()) == self._mark:
+            return []
+        changes = self._store.changes_since(self._map_id, self._since())
+        if self.newest and all(change.id != self.newest for change in changes):
+            self.skip()
+            return None
+        new = [change for change in changes if change.id not in self.seen]
+        self._note(changes)
+        return new
+
+    def _since(self) -> int:
+        return max(0, self.newest - self._overlap)
+
+    def _note(self, changes: Sequence[Change]) -> None:
+        self.newest = max([self.newest, *(change.id for change in changes)])
+        since = self._since()
+        self.seen = frozenset(change.id for change in changes if change.id > since)
+        self._mark = ChangeMark(max(self.seen, default=0), len(self.seen), sum(self.seen))
+
+
+def summary_of(changes: Sequence[Change] | None) -> MapChange:
+    """Changes as sets of keyframes. One that was added and then deleted is only gone."""
+    if changes is None:
+        return MapChange(everything=True)
+    gone = frozenset(change.keyframe_id for change in changes if change.kind is not ChangeKind.ADDED)
+    added = frozenset(change.keyframe_id for change in changes if change.kind is ChangeKind.ADDED)
+    return MapChange(added - gone, gone)
