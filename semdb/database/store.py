@@ -216,6 +216,30 @@ class Store:
         """All vectors of a map in chunks: ids int64 ``[n]``, ascending, and vectors ``[n, d]``. Raises CodecError."""
         return scanning.iter_vectors(self.engine, map_id, chunk)
 
+    def change_text(self, map_id: int, change_id: int) -> str | None:
+        """All that the log of changes says in one row; None where there is no such row."""
+        return change_log.change_text(self.engine, map_id, change_id)
+
+    def coarse_rows(self, keyframe_ids: Int64Array) -> scanning.CoarseRows:
+        """Vectors and class counts of those keyframes that are there, as of one moment. Raises CodecError."""
+        return scanning.coarse_rows(self.engine, keyframe_ids)
+
+    def map_categories(self, map_id: int) -> list[tuple[int, str]]:
+        """Ids and names of the classes that keyframes of a map show."""
+        return scanning.map_categories(self.engine, map_id)
+
+    def category_column(self, map_id: int, category_id: int) -> tuple[Int64Array, Int64Array]:
+        """Keyframes of a map that show a class, and how many objects of it each shows."""
+        return scanning.category_column(self.engine, map_id, category_id)
+
+    def map_sums(self, map_id: int, most_objects: int) -> scanning.MapSums:
+        """Sums over a map that a mirror of it must have too."""
+        return scanning.map_sums(self.engine, map_id, most_objects)
+
+    def map_identity(self, map_id: int) -> str:
+        """A map's name and when it was made; empty where there is none."""
+        return scanning.map_identity(self.engine, map_id)
+
     def planned_frames(self, map_name: str, recording: str) -> tuple[int, ...]:
         """Frame indexes of the stored plan of a recording, ascending; empty where there is none."""
         return lookups.planned_frames(self.engine, map_name, recording)
