@@ -27,6 +27,7 @@ COMMANDS: dict[str, str] = {
     "status": "semdb.cli.status",
     "retry": "semdb.cli.status:retry",
     "delete": "semdb.cli.delete",
+    "refine": "semdb.cli.refine",
     "localize": "semdb.cli.localize",
     "evaluate": "semdb.cli.evaluate",
     "sql": "semdb.cli.sql",

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import datetime
 from enum import StrEnum
+from typing import Any
 
 from semdb.types import Camera, Description, Float32Array, FloatArray, Keypoints, ObjectGeometry
 
@@ -163,6 +165,41 @@ class ChangeMark:
     newest: int  # 0: nothing there
     rows: int
     sum_of_ids: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapObject:
+    """A detected object that has a place in its map. `keyframe` numbers keyframes by recording's name and frame."""
+
+    keyframe: int
+    category: str
+    score: float
+    world_from_camera: FloatArray  # [4, 4]
+    centroid: tuple[float, float, float]  # camera frame, metres
+    extent: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class ClassConfusion:
+    """The detector takes `category` for `other` in a share of `weight` millionths, seen in `pairs` pairs of objects."""
+
+    category: str
+    other: str
+    pairs: int
+    weight: int
+
+
+@dataclass(frozen=True, slots=True)
+class Refinement:
+    """A step of `semdb refine`. `current`: the map is still as it was then."""
+
+    map_id: int
+    map: str
+    kind: str
+    current: bool
+    computed_at: datetime
+    parameters: Mapping[str, Any]
+    rows: int
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
-from sqlalchemy import Engine, select
+from sqlalchemy import Connection, Engine, select
 
 from semdb.class_score import ClassQuery
 from semdb.database import (
@@ -14,6 +15,7 @@ from semdb.database import (
     lookups,
     planning,
     reading,
+    refinements,
     reporting,
     retry,
     scanning,
@@ -24,14 +26,17 @@ from semdb.database.ids import SharedIds
 from semdb.database.records import (
     Change,
     ChangeMark,
+    ClassConfusion,
     Deleted,
     FailedItem,
     KeyframeRecord,
     MapInfo,
+    MapObject,
     PlannedRecording,
     RecordingPlan,
     RecordingState,
     RecordingStatus,
+    Refinement,
     ScoredKeyframe,
     StoredImage,
     StoredKeyframe,
@@ -255,6 +260,38 @@ class Store:
     def category_counts(self, map_id: int) -> list[tuple[int, str, int]]:
         """Keyframe id, class and number of objects, of every keyframe of a map that shows any."""
         return lookups.category_counts(self.engine, map_id)
+
+    # refinements
+
+    def map_state(self, map_id: int) -> str:
+        """What a map holds, in a line: see `semdb.database.refinements`."""
+        return refinements.map_state(self.engine, map_id)
+
+    def refinements(self, map_id: int | None = None) -> list[Refinement]:
+        """What `semdb refine` computed of a map, or of all, and whether the map is still the same."""
+        return refinements.list_refinements(self.engine, map_id)
+
+    def iter_objects(self, map_id: int, progress: Progress | None = None) -> Iterator[MapObject]:
+        """All objects of a map that have a place in it, in an order that does not depend on ids."""
+        return refinements.iter_objects(self.engine, map_id, progress)
+
+    def replace_refinement(
+        self,
+        map_id: int,
+        kind: str,
+        state: str,
+        parameters: Mapping[str, Any],
+        write: Callable[[Connection, int, Any], int],
+        result: Any,
+    ) -> int:
+        """Replace what a step computed, in one transaction: see `refinements.replace_refinement`."""
+        return refinements.replace_refinement(
+            self.engine, map_id, kind, state, parameters, lambda connection: write(connection, map_id, result)
+        )
+
+    def class_confusions(self, map_id: int) -> list[ClassConfusion]:
+        """Which classes are taken for each other in a map, as of the last `semdb refine`."""
+        return refinements.load_confusions(self.engine, map_id)
 
     # deletion and log
 

@@ -237,3 +237,22 @@ queries = _table(
     Column("timing_ms", LongText, nullable=False),
     Index(None, "map_id", "created_at"),
 )
+
+refinements = _table(
+    "refinements",
+    _ref("map_id", "maps.id", primary_key=True),
+    Column("kind", String(32), primary_key=True),
+    Column("map_state", String(NAME_LENGTH), nullable=False),
+    _time("computed_at"),
+    Column("parameters", LongText, nullable=False),
+    Column("row_count", BigInteger, nullable=False),
+)
+
+class_confusions = _table(
+    "class_confusions",
+    _ref("map_id", "maps.id", primary_key=True),
+    _ref("category_id", "categories.id", cascade=False, primary_key=True, index=True),
+    _ref("other_category_id", "categories.id", cascade=False, primary_key=True, index=True),
+    Column("pairs", BigInteger, nullable=False),
+    Column("weight", Integer, nullable=False),
+)

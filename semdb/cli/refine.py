@@ -1,0 +1,56 @@
+"""`semdb refine`: what needs more than one keyframe, computed anew where a map has changed."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+
+from semdb.cli.options import JsonFlag, Overrides, settings_options
+
+
+@settings_options(models=False)
+def command(
+    overrides: Overrides,
+    map_name: Annotated[str | None, typer.Option("--map", metavar="M", help="Only this map; default: all.")] = None,
+    step: Annotated[
+        list[str] | None, typer.Option("--step", metavar="STEP", help="Only this step; repeatable.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Also what is up to date.")] = False,
+    json: JsonFlag = False,
+) -> None:
+    """Compute what needs more than one keyframe: which classes the detector takes for each other.
+
+    Nothing else depends on it: ingest, deletion and localization work without. Does only what is out of date.
+    """
+    from semdb.cli.output import print_json
+    from semdb.cli.progress import StagedProgress, say
+    from semdb.database.store import open_store
+    from semdb.refine import refine_map, steps_of
+
+    steps_of(step or ())
+    done: list[dict[str, Any]] = []
+    with open_store(overrides.settings().database_url) as store:
+        infos = [store.find_map(map_name)] if map_name is not None else [i for i in store.maps() if i.keyframes]
+        for info in infos:
+            with StagedProgress() as progress:
+                results = refine_map(store, info, kinds=step or (), force=force, progress=progress.update)
+            for result in results:
+                state = "computed" if result.computed else "up to date"
+                if not json:
+                    print(f"{info.name}: {result.summary}: {result.rows} rows, {state}")
+                if not result.current:
+                    say(f"{info.name}: the map changed meanwhile, so {result.summary} is out of date: run it again")
+                done.append(
+                    {
+                        "map": info.name,
+                        "step": result.kind,
+                        "rows": result.rows,
+                        "computed": result.computed,
+                        "current": result.current,
+                    }
+                )
+    if json:
+        print_json(done)
+    elif not infos:
+        say("there is no keyframe to refine: ingest a recording first")
