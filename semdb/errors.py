@@ -19,6 +19,10 @@ class RecordingError(SemdbError):
     """A recording cannot be used at all; the message names the file and, where there is one, the line."""
 
 
+class RecordingUnavailableError(RecordingError):
+    """The folder of a recording is not there now: a mount that was lost may come back."""
+
+
 class FrameError(SemdbError):
     """One frame of a recording, or one query image, cannot be read; the rest of the recording can."""
 
@@ -29,6 +33,14 @@ class ModelError(SemdbError):
 
 class DatabaseError(SemdbError):
     """The database does not answer, or refused a statement for good."""
+
+
+class DatabaseUnavailableError(DatabaseError):
+    """The database does not answer or has no room now; the same work may succeed later."""
+
+
+class LeaseLostError(DatabaseError):
+    """Another worker has taken over what this one was working on: nothing was written."""
 
 
 class SchemaError(DatabaseError):

@@ -9,6 +9,9 @@ from sqlalchemy import URL, Connection, Engine, create_engine, event
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError
 
+from semdb.database.blobs import BlobCursor
+from semdb.database.hosts import HOSTS, Failover, join_hosts, split_hosts
+from semdb.database.tls import TLS_KEYS, tls_arguments
 from semdb.errors import DatabaseError, UsageError
 
 CONNECT_TIMEOUT_S = 5
@@ -21,10 +24,13 @@ _SERVER_SETTINGS = (
 
 
 def parse_url(url: str) -> URL:
-    """The URL, its driver made explicit. Raises UsageError for anything but SQLite files and MySQL servers."""
+    """The URL, its driver made explicit. Raises UsageError for anything but SQLite files and MySQL servers.
+
+    Several hosts (``HOST1:PORT1,HOST2:PORT2``) become the first one and the query parameter ``hosts``.
+    """
     hint = "use sqlite:///FILE or mysql+pymysql://USER:PASSWORD@HOST/SCHEMA"
     try:
-        parsed = make_url(url)
+        parsed = make_url(split_hosts(url))
     except (ArgumentError, ValueError) as error:
         raise UsageError(f"the database URL cannot be read; {hint}") from error
     backend = parsed.get_backend_name()
@@ -35,13 +41,18 @@ def parse_url(url: str) -> URL:
     if backend in ("mysql", "mariadb"):
         if not parsed.database:
             raise UsageError(f"the database URL {safe_url(parsed)} names no schema; {hint}")
+        unknown = sorted(set(parsed.query) - TLS_KEYS - {HOSTS})
+        if unknown:  # a misspelled ssl_mode must not connect without TLS
+            known = ", ".join(sorted(TLS_KEYS))
+            raise UsageError(f"the database URL {safe_url(parsed)} has a parameter {unknown[0]!r}; known are {known}")
+        tls_arguments(parsed)
         return parsed.set(drivername="mysql+pymysql")
     raise UsageError(f"databases of the kind {backend!r} are not supported; {hint}")
 
 
 def safe_url(url: URL) -> str:
     """The URL for messages, without the password."""
-    return url.render_as_string(hide_password=True)
+    return join_hosts(url.render_as_string(hide_password=True), url)
 
 
 def make_engine(url: str, *, read_timeout_s: int | None = None) -> Engine:
@@ -80,11 +91,18 @@ def make_server_engine(url: URL, read_timeout_s: int | None = None) -> Engine:
     limits = {"connect_timeout": CONNECT_TIMEOUT_S, "read_timeout": CONNECT_TIMEOUT_S}
     engine = create_engine(
         url,
-        connect_args={**limits, "charset": "utf8mb4"},
+        connect_args={**limits, "charset": "utf8mb4", "cursorclass": BlobCursor, **tls_arguments(url)},
         pool_pre_ping=True,
         pool_recycle=3600,
         isolation_level="REPEATABLE READ",
     )
+    failover = Failover(url)
+
+    @event.listens_for(engine, "do_connect")
+    def _connect(dialect: Any, _record: Any, _arguments: Any, parameters: dict[str, Any]) -> Any:
+        for name in set(parameters) & (TLS_KEYS | {HOSTS, "ssl"}):
+            del parameters[name]  # what the dialect made of the URL's query
+        return failover.connect(dialect, {**parameters, **tls_arguments(url)})
 
     @event.listens_for(engine, "connect")
     def _configure(connection: Any, record: Any) -> None:

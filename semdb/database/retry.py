@@ -1,9 +1,10 @@
 """The one place where a transaction is run, and run again when the database asks for it.
 
-Retried with back-off: deadlock (1213), lock timeout (1205), lost connection (2006, 2013; 2003 while a server that
-has answered before restarts), a cluster node that is not ready (1047), and a busy SQLite file. The work is given a
-fresh transaction each time, so it must not keep anything from an earlier attempt; all writes of semdb are idempotent,
-so a commit whose answer was lost is safe to repeat.
+Retried with back-off: deadlock and failed certification (1213), lock timeout (1205), lost connection (2006, 2013; 2003
+while a server that has answered before restarts), a server that shuts down or has no connection left (1053, 1040), a
+cluster node that is not ready (1047), and a busy SQLite file. The work is given a fresh transaction each time, so
+it must not keep anything from an earlier attempt; all writes of semdb are idempotent, so a commit whose answer was lost
+is safe to repeat. What lasts longer is repeated by workers as whole tasks, by the same rules: `task_delay_s`.
 """
 
 from __future__ import annotations
@@ -18,14 +19,20 @@ from sqlalchemy import Connection, Engine
 from sqlalchemy.exc import DBAPIError, IntegrityError, SQLAlchemyError
 
 from semdb.database.engine import WRITE, safe_url
-from semdb.errors import DatabaseError
+from semdb.errors import DatabaseError, DatabaseUnavailableError, RecordingUnavailableError
 
 T = TypeVar("T")
 _answered: WeakSet[Engine] = WeakSet()  # engines that have had a connection
 ATTEMPTS = 10
 FIRST_DELAY_S = 0.05
 LONGEST_DELAY_S = 3.0
-RETRIED_CODES = frozenset({1213, 1205, 2006, 2013, 1047})
+RETRIED_CODES = frozenset({1213, 1205, 2006, 2013, 1047, 1040, 1053})
+# What a task may meet and is worth repeating later.
+MAY_HEAL = (DatabaseUnavailableError, RecordingUnavailableError)
+FIRST_TASK_DELAY_S = 2.0
+LONGEST_TASK_DELAY_S = 300.0
+_NOT_READY = {1047, 1053}
+_NO_ROOM = {3, 28, 1021, 1026, 1114}
 # Nothing listens, no such host, access denied, no such schema: trying again does not help.
 _UNREACHABLE = {2002, 2003, 2005}
 _LOST = {2006, 2013}
@@ -48,8 +55,13 @@ def _run(engine: Engine, work: Callable[[Connection], T], *, write: bool) -> T:
         try:
             with engine.connect().execution_options(**{WRITE: write}) as connection:
                 _answered.add(engine)
-                with connection.begin():
-                    return work(connection)
+                try:
+                    with connection.begin():
+                        return work(connection)
+                except DBAPIError as error:
+                    if error_code(error) in _NOT_READY:  # another node, or this one later, over a new connection
+                        connection.invalidate(error)
+                    raise
         except IntegrityError as error:
             if error_code(error) != 1213:  # a certification failure may be reported on any statement
                 raise
@@ -67,6 +79,11 @@ def _run(engine: Engine, work: Callable[[Connection], T], *, write: bool) -> T:
     raise AssertionError("unreachable")
 
 
+def task_delay_s(retries: int) -> float:
+    """Seconds before a task that met one of `MAY_HEAL` is run again, after so many `retries`."""
+    return float(min(FIRST_TASK_DELAY_S * 2 ** min(retries, 16), LONGEST_TASK_DELAY_S) * random.uniform(0.5, 1.0))
+
+
 def error_code(error: Exception) -> int | None:
     """The server's error number, of SQLAlchemy's errors and the driver's; None where there is none (SQLite)."""
     arguments = getattr(getattr(error, "orig", None) or error, "args", ())
@@ -81,10 +98,17 @@ def is_transient(error: DBAPIError, *, answered: bool = True) -> bool:
     code = error_code(error)
     if code in _UNREACHABLE or code in _LOST:
         return answered
+    if error.connection_invalidated and code in (None, 0):  # the driver's own word for a connection that is closed
+        return answered
     if code in RETRIED_CODES:
         return True
+    return is_busy(error)
+
+
+def is_busy(error: Exception) -> bool:
+    """Whether a SQLite file is held by another connection."""
     # The base class names are the result codes; extended codes such as SQLITE_BUSY_SNAPSHOT start with them.
-    name = getattr(error.orig, "sqlite_errorname", "") or ""
+    name = getattr(getattr(error, "orig", None), "sqlite_errorname", "") or ""
     return name.startswith(("SQLITE_BUSY", "SQLITE_LOCKED"))
 
 
@@ -110,10 +134,12 @@ def explain(
         advice = "is held by another process: wait for it or end it"
     elif name == "SQLITE_READONLY" or name.startswith("SQLITE_READONLY"):
         advice = "cannot be written: check the rights of the file and its folder"
-    elif name == "SQLITE_FULL":
-        advice = "cannot grow: the disk is full"
+    elif name == "SQLITE_FULL" or code in _NO_ROOM:
+        advice = "cannot grow: its disk, or the room that it was given, is full; make room and run the command again"
     elif code in RETRIED_CODES:
         advice = f"failed {attempts} times in a row: the server is down or overloaded; run the command again"
     else:
         advice = "refused a statement"
-    return DatabaseError(f"the database {where} {advice} ({reason})")
+    heals = is_busy(error) or code in _UNREACHABLE | _LOST | _NO_ROOM | RETRIED_CODES or name == "SQLITE_FULL"
+    kind = DatabaseUnavailableError if heals else DatabaseError
+    return kind(f"the database {where} {advice} ({reason})")

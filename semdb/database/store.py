@@ -23,6 +23,7 @@ from semdb.database import (
 )
 from semdb.database.engine import make_engine, parse_url, safe_url, sqlite_path
 from semdb.database.ids import SharedIds
+from semdb.database.items import Claim
 from semdb.database.records import (
     Change,
     ChangeMark,
@@ -141,9 +142,9 @@ class Store:
         """Record what is to be ingested, or find what is left of it: see `planning.plan_recording`."""
         return planning.plan_recording(self.engine, self._ids, map_id, plan, models)
 
-    def write_keyframe(self, recording_id: int, record: KeyframeRecord) -> WriteResult:
+    def write_keyframe(self, recording_id: int, record: KeyframeRecord, claimed: Claim | None = None) -> WriteResult:
         """Store one planned keyframe with all its rows in one transaction, once: see `KeyframeWriter.write`."""
-        return self._writer.write(recording_id, record)
+        return self._writer.write(recording_id, record, claimed)
 
     def fail_item(self, recording_id: int, frame_index: int, error: str) -> None:
         """Note that a planned keyframe could not be described or stored."""

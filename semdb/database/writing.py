@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from sqlalchemy import Connection, Engine, Table, insert, select, update
@@ -15,9 +15,10 @@ from semdb.database import retry, tables
 from semdb.database.codecs import encode_array, encode_keypoints, encode_mask, image_format
 from semdb.database.engine import check_packet
 from semdb.database.ids import SharedIds
+from semdb.database.items import Claim, held_by
 from semdb.database.planning import check_models, map_model_ids
 from semdb.database.records import ChangeKind, ItemState, KeyframeRecord, RecordingState, WriteResult
-from semdb.errors import DatabaseError, NotFoundError, UsageError
+from semdb.errors import DatabaseError, LeaseLostError, NotFoundError, UsageError
 from semdb.geometry import quat_wxyz_from_rotation
 from semdb.types import Description, FloatArray, ModelInfo
 
@@ -60,9 +61,10 @@ class KeyframeWriter:
         self._targets = {}
         self._ids.forget()
 
-    def write(self, recording_id: int, record: KeyframeRecord) -> WriteResult:
+    def write(self, recording_id: int, record: KeyframeRecord, claimed: Claim | None = None) -> WriteResult:
         """Store one planned keyframe; a keyframe that is there stays as it is.
 
+        With `claimed` only while that claim holds: LeaseLostError when it does not, and nothing is written.
         Raises ProvenanceError for other models than the map's, NotFoundError without such a recording, UsageError
         for a frame that is not in its plan or a description that contradicts itself, DatabaseError for a value
         that is too large for the server or when the database gives up.
@@ -74,7 +76,8 @@ class KeyframeWriter:
             check_models(target.model_ids, record.description.models, f"the map {target.map_name!r}")
             rows = self._encode(target, record)
             try:
-                return retry.write(self._engine, partial(_write, target=target, recording_id=recording_id, rows=rows))
+                work = partial(_write, target=target, recording_id=recording_id, rows=rows, claimed=claimed)
+                return retry.write(self._engine, work)
             except IntegrityError as error:
                 # Another writer stored the same keyframe, or a row that was remembered has been deleted.
                 failure = error
@@ -96,9 +99,7 @@ class KeyframeWriter:
             )
             row = connection.execute(query).one_or_none()
             if row is None or row.state == RecordingState.DELETING:
-                raise NotFoundError(
-                    f"there is no recording with the id {recording_id}: it was deleted, or never planned"
-                )
+                raise _no_recording(recording_id)
             if row.state == RecordingState.PLANNED:
                 change = update(tables.recordings).where(tables.recordings.c.id == recording_id)
                 connection.execute(change.values(state=RecordingState.INGESTING.value))
@@ -214,19 +215,22 @@ def _object_rows(description: Description, category_ids: Mapping[str, int], mode
     return rows
 
 
-def _write(connection: Connection, target: _Target, recording_id: int, rows: _Rows) -> WriteResult:
+def _write(
+    connection: Connection, target: _Target, recording_id: int, rows: _Rows, claimed: Claim | None
+) -> WriteResult:
     frame_index = rows.keyframe["frame_index"]
-    keyframes, items = tables.keyframes.c, tables.ingest_items.c
-    there = select(keyframes.id).where(keyframes.recording_id == recording_id, keyframes.frame_index == frame_index)
-    keyframe_id = connection.execute(there).scalar()
-    done = (
-        update(tables.ingest_items)
-        .where(items.recording_id == recording_id, items.frame_index == frame_index)
-        .values(state=ItemState.DONE.value, attempts=items.attempts + 1, error=None, worker=None, lease_until=None)
-    )
-    if keyframe_id is not None:
-        connection.execute(done.where(items.state != ItemState.DONE.value))
-        return WriteResult(int(keyframe_id), created=False)
+    # First, so that whoever comes second to the same keyframe waits here, before anything large is sent.
+    taken = _take(connection, recording_id, frame_index, claimed)
+    if not taken:
+        keyframes, items = tables.keyframes.c, tables.ingest_items.c
+        there = select(keyframes.id).where(keyframes.recording_id == recording_id, keyframes.frame_index == frame_index)
+        keyframe_id = connection.execute(there).scalar()
+        if keyframe_id is not None:
+            own = select(items.attempts).where(items.recording_id == recording_id, items.frame_index == frame_index)
+            # A commit whose answer was lost is run again: then what is there is what this claim stored.
+            mine = claimed is not None and connection.execute(own).scalar() == claimed.token
+            return WriteResult(int(keyframe_id), created=mine)
+        _refuse(connection, recording_id, frame_index)
     key = connection.execute(insert(tables.keyframes), {**rows.keyframe, "recording_id": recording_id})
     if key.inserted_primary_key is None:
         raise DatabaseError("the database gave no id for a new keyframe")
@@ -234,9 +238,38 @@ def _write(connection: Connection, target: _Target, recording_id: int, rows: _Ro
     _write_children(connection, keyframe_id, rows)
     change = {"map_id": target.map_id, "keyframe_id": keyframe_id, "kind": ChangeKind.ADDED.value}
     connection.execute(insert(tables.keyframe_changes), change)
-    if connection.execute(done).rowcount != 1:
-        raise UsageError(f"frame {frame_index} is not in the plan of the recording {recording_id}")
     return WriteResult(keyframe_id, created=True)
+
+
+def _take(connection: Connection, recording_id: int, frame_index: int, claimed: Claim | None) -> bool:
+    """Marks an item done. False when there is none to be done: stored already, of another claim, or not planned."""
+    items = tables.ingest_items.c
+    values: dict[str, Any] = {"state": ItemState.DONE.value, "error": None, "worker": None, "lease_until": None}
+    change = update(tables.ingest_items)
+    if claimed is not None:
+        change = change.where(held_by(recording_id, claimed))
+    else:
+        done = (ItemState.DONE.value, ItemState.DELETED.value)
+        change = change.where(items.recording_id == recording_id, items.frame_index == frame_index)
+        change = change.where(items.state.not_in(done))
+        values["attempts"] = items.attempts + 1
+    return connection.execute(change.values(**values)).rowcount == 1
+
+
+def _refuse(connection: Connection, recording_id: int, frame_index: int) -> NoReturn:
+    """Raises the error for a keyframe that may not be written."""
+    items = tables.ingest_items.c
+    query = select(tables.recordings.c.state).where(tables.recordings.c.id == recording_id)
+    if connection.execute(query).scalar() in (None, RecordingState.DELETING.value):
+        raise _no_recording(recording_id)
+    planned = select(items.state).where(items.recording_id == recording_id, items.frame_index == frame_index)
+    if connection.execute(planned).scalar() is None:
+        raise UsageError(f"frame {frame_index} is not in the plan of the recording {recording_id}")
+    raise LeaseLostError(f"frame {frame_index} of the recording {recording_id} is another worker's by now, or deleted")
+
+
+def _no_recording(recording_id: int) -> NotFoundError:
+    return NotFoundError(f"there is no recording with the id {recording_id}: it was deleted, or never planned")
 
 
 def _write_children(connection: Connection, keyframe_id: int, rows: _Rows) -> None:
@@ -253,7 +286,7 @@ def _write_children(connection: Connection, keyframe_id: int, rows: _Rows) -> No
     if not rows.objects:
         return
     for row in rows.objects:
-        _check_size(connection, tables.objects, row, rows.keyframe["frame_index"])
+        _check_size(connection, tables.objects, row, rows.keyframe["frame_index"], 2)  # written in hexadecimal
     connection.execute(insert(tables.objects), [{**key, **row} for row in rows.objects])
     connection.execute(insert(tables.keyframe_categories), [{**key, **row} for row in rows.categories])
     query = select(tables.objects.c.ordinal, tables.objects.c.id).where(tables.objects.c.keyframe_id == keyframe_id)
@@ -262,7 +295,7 @@ def _write_children(connection: Connection, keyframe_id: int, rows: _Rows) -> No
     connection.execute(insert(tables.object_features), slices)
 
 
-def _check_size(connection: Connection, table: Table, row: dict[str, Any], frame_index: int) -> None:
-    # The driver writes blobs in hexadecimal: two bytes per byte.
-    size = _STATEMENT_OVERHEAD + sum(2 * len(value) for value in row.values() if isinstance(value, bytes))
+def _check_size(connection: Connection, table: Table, row: dict[str, Any], frame_index: int, factor: int = 1) -> None:
+    """Raises DatabaseError where the server does not take a row of `factor` bytes for each of its blobs'."""
+    size = _STATEMENT_OVERHEAD + sum(factor * len(value) for value in row.values() if isinstance(value, bytes))
     check_packet(connection, size, f"the {table.name} row of frame {frame_index}")

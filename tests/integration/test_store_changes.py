@@ -175,7 +175,7 @@ def test_missing_keypoints_are_an_error_not_an_empty_keyframe(store: Store) -> N
 
 def test_a_value_that_the_server_does_not_take_is_refused_before_it_is_sent(store: Store) -> None:
     planned = store.plan_recording(store.ensure_map("room"), plan("r", [1]), MODELS)
-    large = dataclasses.replace(record(1, description(1)), image_bytes=PNG + bytes(9 * 2**20))
+    large = dataclasses.replace(record(1, description(1)), image_bytes=PNG + bytes(17 * 2**20))
     if store.engine.dialect.name == "sqlite":  # has no such limit
         assert store.write_keyframe(planned.recording_id, large).created
         return
