@@ -92,7 +92,7 @@ def ingest_recordings(
             for note in (*recording.notes, *specs.notes):
                 (say or _nobody)(f"{recording.name}: {note}")
             own = settings_of_map(settings, map_models)
-            key = (specs, own.score_threshold, own.max_keypoints)
+            key = (specs, own.score_threshold, own.max_keypoints, own.classes, own.dynamic)
             if key not in describers:
                 describers[key] = describer_from_specs(specs.detector, specs.encoder, specs.features, own)
             summary = ingest_recording(recording, store, describers[key], options, progress=progress)

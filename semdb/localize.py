@@ -174,7 +174,7 @@ def _open_map(
     models = store.map_models(info.id)
     specs = specs_for_query(settings, models)
     own = settings_of_map(settings, models)
-    key = (specs, own.score_threshold, own.max_keypoints)
+    key = (specs, own.score_threshold, own.max_keypoints, own.classes, own.dynamic)
     if key not in describers:
         describers[key] = describer_from_specs(specs.detector, specs.encoder, specs.features, own)
     check_models(models, describers[key].models, f"the map {info.name!r}")

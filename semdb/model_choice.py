@@ -90,6 +90,10 @@ def settings_of_map(settings: Settings, map_models: Sequence[ModelInfo]) -> Sett
         for name in ("score_threshold", "max_keypoints"):
             if name in config and name not in settings.model_fields_set:
                 taken[name] = config[name]
+        if model.role == "detector":
+            for name in ("classes", "dynamic"):
+                if name in config and name not in settings.model_fields_set:
+                    taken[name] = ",".join(config[name])
     return settings.model_copy(update=taken)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
 from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -20,12 +19,20 @@ class Settings(BaseSettings):
     reader_url: str | None = Field(None, description="SELECT-only account that `semdb sql` uses on a server")
     detector: str = Field(
         "auto",
-        description="auto, onnx:FILE or recorded. auto: a query takes the map's own; an ingest takes the "
-        "recording's masks and says so",
+        description="auto, onnx:FILE, torchvision:NAME or recorded. auto: a query takes the map's own; an ingest takes "
+        "the recording's masks and says so",
     )
-    encoder: str = Field("auto", description="auto, onnx:FILE or gist. auto: a query takes the map's own")
+    encoder: str = Field(
+        "auto", description="auto, onnx:FILE, torchvision:NAME or gist. auto: a query takes the map's own"
+    )
     features: str = Field("auto", description="auto, surf, sift or orb. auto: the map's own, or surf")
-    device: Literal["cpu"] = Field("cpu", description="device of the networks; this version runs them on the CPU")
+    device: str = Field(
+        "auto",
+        pattern=r"^(auto|cpu|mps|cuda(:\d+)?)$",
+        description="device of the networks: auto, cpu, cuda, cuda:1, mps",
+    )
+    classes: str | None = Field(None, description="only objects of these classes: names, indoor, or all")
+    dynamic: str | None = Field(None, description="classes of objects that move: no feature lies on them; or none")
     score_threshold: float = Field(0.5, ge=0.0, le=1.0, description="detections below are not kept")
     max_keypoints: int = Field(1500, ge=50, le=20000, description="keypoints kept per image, by response")
     threads: int = Field(2, ge=1, le=256, description="threads of one process for networks and kernels")

@@ -151,12 +151,14 @@ class Description:
     cnn_vector: Float32Array  # [d], L2-normalised
     models: tuple[ModelInfo, ...]  # detector, encoder, features
     timing_ms: Mapping[str, float] = field(default_factory=dict)  # detect, encode, features
+    dynamic: frozenset[str] = frozenset()  # categories of objects that move: they say nothing about a place
 
     @property
     def category_counts(self) -> dict[str, int]:
         counts: dict[str, int] = {}
         for detection in self.detections:
-            counts[detection.category] = counts.get(detection.category, 0) + 1
+            if detection.category not in self.dynamic:
+                counts[detection.category] = counts.get(detection.category, 0) + 1
         return counts
 
 

@@ -37,6 +37,24 @@ Device = Annotated[
     str | None,
     typer.Option("--device", metavar="NAME", help="Device of the networks; over SEMDB_DEVICE.", rich_help_panel=_PANEL),
 ]
+Classes = Annotated[
+    str | None,
+    typer.Option(
+        "--classes",
+        metavar="NAMES",
+        help="Keep objects of these classes only; over SEMDB_CLASSES.",
+        rich_help_panel=_PANEL,
+    ),
+]
+Dynamic = Annotated[
+    str | None,
+    typer.Option(
+        "--dynamic",
+        metavar="NAMES",
+        help="Classes of objects that move: no keypoint lies on them; over SEMDB_DYNAMIC.",
+        rich_help_panel=_PANEL,
+    ),
+]
 CameraOption = Annotated[
     str | None,
     typer.Option(
@@ -57,6 +75,8 @@ class Overrides:
     encoder: str | None = None
     features: str | None = None
     device: str | None = None
+    classes: str | None = None
+    dynamic: str | None = None
 
     def settings(self) -> Settings:
         """Settings of the environment under these options. Raises `UsageError` naming the variable or option."""
@@ -82,13 +102,21 @@ def load_settings(**given: object) -> Settings:
 
 
 _DATABASE = {"database_url": DatabaseUrl}
-_MODELS = {**_DATABASE, "detector": Detector, "encoder": Encoder, "features": Features, "device": Device}
+_MODELS = {
+    **_DATABASE,
+    "detector": Detector,
+    "encoder": Encoder,
+    "features": Features,
+    "device": Device,
+    "classes": Classes,
+    "dynamic": Dynamic,
+}
 
 
 def settings_options(*, models: bool) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Decorator: the parameter ``overrides: Overrides`` of a command becomes the options that change settings.
 
-    `models` False gives ``--database-url``; True adds ``--detector``, ``--encoder``, ``--features``, ``--device``.
+    `models` False gives ``--database-url``; True adds those of ``_MODELS``: detector, encoder, …
     """
     options = _MODELS if models else _DATABASE
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from semdb.errors import ModelError
+from semdb.errors import ModelError, UsageError
 from semdb.settings import Settings
 
 _HASHES: dict[tuple[str, int, int], str] = {}
@@ -39,9 +40,14 @@ def resolve_onnx(spec: str, settings: Settings) -> Path:
 
     Raises ModelError when the file is not there or is a folder.
     """
-    text = spec.removeprefix("onnx:")
+    return resolve_file(spec, "onnx:", "an .onnx file", settings)
+
+
+def resolve_file(spec: str, prefix: str, kind: str, settings: Settings) -> Path:
+    """The file of a spec `prefix` + FILE, as for `resolve_onnx`; `kind` says in errors what the file should be."""
+    text = spec.removeprefix(prefix)
     if not text:
-        raise ModelError(f"{spec!r} names no file: write onnx:FILE, with FILE the path of an .onnx file")
+        raise ModelError(f"{spec!r} names no file: write {prefix}FILE, with FILE the path of {kind}")
     path = Path(text).expanduser()
     tried = [path]
     if path.name == text:
@@ -50,7 +56,7 @@ def resolve_onnx(spec: str, settings: Settings) -> Path:
         if candidate.is_file():
             return candidate
     if path.is_dir():
-        raise ModelError(f"{path} is a folder: write onnx:FILE, with FILE the path of an .onnx file in it")
+        raise ModelError(f"{path} is a folder: write {prefix}FILE, with FILE the path of {kind} in it")
     places = " or ".join(str(candidate) for candidate in tried)
     raise ModelError(f"no model file at {places} (from the spec {spec!r}): check the path, or put the file there")
 
@@ -61,15 +67,16 @@ def canonical_json(config: dict[str, Any]) -> str:
 
 
 class OnnxModel:
-    """An ONNX network with one image input ``[B, 3, H, W]``, opened on the CPU.
+    """An ONNX network with one image input ``[B, 3, H, W]``.
 
     `path` is the file, `outputs` the names of all its outputs, `metadata` its ``metadata_props``.
     """
 
-    def __init__(self, path: Path, threads: int, required_outputs: tuple[str, ...]) -> None:
-        """Open `path` with `threads` threads; its outputs must include `required_outputs`.
+    def __init__(self, path: Path, threads: int, required_outputs: tuple[str, ...], device: str = "cpu") -> None:
+        """Open `path` on `device` (on the CPU with `threads` threads); its outputs must include `required_outputs`.
 
-        Raises ModelError when the file is no ONNX model or has other inputs or outputs.
+        Raises ModelError when the file is no ONNX model or has other inputs or outputs, UsageError when this ONNX
+        Runtime cannot use the device.
         """
         import onnxruntime as ort
 
@@ -80,8 +87,9 @@ class OnnxModel:
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         options.log_severity_level = 3
         self.path = path
+        providers = onnx_providers(device, ort.get_available_providers())
         try:
-            self._session = ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+            self._session = ort.InferenceSession(str(path), options, providers=providers)
         except Exception as error:  # ONNX Runtime's exceptions share no base class
             raise ModelError(
                 f"{path} cannot be opened as an ONNX model ({first_line(error)}); is it complete, and a model?"
@@ -108,6 +116,22 @@ class OnnxModel:
         except Exception as error:
             shape = "x".join(str(n) for n in batch.shape)
             raise ModelError(f"{self.path} failed on an input of {shape}: {first_line(error)}") from error
+
+
+def onnx_providers(device: str, available: Sequence[str]) -> list[Any]:
+    """ONNX Runtime's providers for a device setting, given those that it has; ``auto`` is CUDA where there is one.
+
+    Raises UsageError for a device that it does not have.
+    """
+    cpu, cuda = "CPUExecutionProvider", "CUDAExecutionProvider"
+    if device == "cpu" or (device == "auto" and cuda not in available):
+        return [cpu]
+    if device == "mps" or cuda not in available:
+        raise UsageError(
+            f"SEMDB_DEVICE={device}: the installed ONNX Runtime runs on {', '.join(available)}; use cpu or auto"
+            + ("" if device == "mps" else ", or install onnxruntime-gpu in place of onnxruntime")
+        )
+    return [(cuda, {"device_id": int(device.partition(":")[2] or 0)}), cpu]
 
 
 def first_line(error: Exception) -> str:

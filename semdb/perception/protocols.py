@@ -6,6 +6,7 @@ by its spec string. Objects must be safe to call from several threads, one call 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 from semdb.types import BoolArray, Detection, Features, Float32Array, ImageArray, InstanceMasks, ModelInfo
@@ -17,12 +18,25 @@ class Detector(Protocol):
     @property
     def info(self) -> ModelInfo: ...
 
+    @property
+    def classes(self) -> tuple[str, ...] | None:
+        """The names of its classes, or None where every recording brings its own, and exact masks."""
+        ...
+
     def detect(self, image: ImageArray, instances: InstanceMasks | None) -> tuple[Detection, ...]:
         """Objects of an RGB `image` ``[H, W, 3]``, by descending score; masks are ``[H, W]`` and never empty.
 
         `instances` are the masks that came with the image, for the detector that takes them; others ignore them.
         Raises ModelError when the model fails on the image.
         """
+        ...
+
+
+class BatchDetector(Detector, Protocol):
+    """A detector that is faster on several images at once."""
+
+    def detect_batch(self, images: Sequence[ImageArray]) -> list[tuple[Detection, ...]]:
+        """What `detect` finds in each of `images`, within rounding. Raises ModelError."""
         ...
 
 
@@ -37,6 +51,14 @@ class Encoder(Protocol):
 
         Raises ModelError when the model fails on the image.
         """
+        ...
+
+
+class BatchEncoder(Encoder, Protocol):
+    """An encoder that is faster on several images at once."""
+
+    def encode_batch(self, images: Sequence[ImageArray]) -> Float32Array:
+        """The vectors ``[n, d]`` of `images`, each as `encode` gives it, within rounding. Raises ModelError."""
         ...
 
 

@@ -172,11 +172,6 @@ def test_encoder_file_is_no_detector(tmp_path: Path) -> None:
         load_detector(f"onnx:{path}", settings())
 
 
-def test_torchvision_says_what_works_now() -> None:
-    with pytest.raises(ModelError, match=r"pip install semdb\[torch\].*onnx:FILE"):
-        load_detector("torchvision:maskrcnn_resnet50_fpn_v2", settings())
-
-
 @pytest.mark.parametrize("spec", ["", "auto", "yolo", "three.onnx"])
 def test_unknown_spec(spec: str) -> None:
     with pytest.raises(UsageError, match=r"no detector .* write onnx:FILE"):

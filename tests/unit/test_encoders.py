@@ -83,8 +83,6 @@ def test_onnx_without_embedding_is_no_encoder(tmp_path: Path) -> None:
 
 
 def test_specs() -> None:
-    with pytest.raises(ModelError, match=r"pip install semdb\[torch\].*onnx:FILE or gist"):
-        load_encoder("torchvision:resnet50-places365", SETTINGS)
     with pytest.raises(UsageError, match=r"no encoder 'auto'"):
         load_encoder("auto", SETTINGS)
     with pytest.raises(ModelError, match=r"no model file at /nowhere/x\.onnx"):

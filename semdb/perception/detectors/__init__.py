@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from semdb.errors import ModelError, UsageError
+from semdb.errors import UsageError
 from semdb.perception.protocols import Detector
 from semdb.settings import Settings
 
 
 def load_detector(spec: str, settings: Settings) -> Detector:
-    """The detector of a `spec`: ``onnx:FILE`` or ``recorded``.
+    """The detector of a `spec`: ``onnx:FILE``, ``torchvision:NAME``, ``torchvision:PATH`` or ``recorded``.
 
-    The network runs on ``settings.threads`` threads; their number does not change the result.
+    The network runs on ``settings.device``, on the CPU with ``settings.threads`` threads.
     Raises UsageError for a spec that is none, ModelError when its file is missing or is no Mask R-CNN.
     """
     if spec == "recorded":
@@ -22,8 +22,10 @@ def load_detector(spec: str, settings: Settings) -> Detector:
 
         return OnnxDetector(spec, settings)
     if spec.startswith("torchvision:"):
-        raise ModelError(
-            f"{spec!r}: torch models come with `pip install semdb[torch]`, but this version of semdb runs Mask R-CNN "
-            "only as onnx:FILE; export the model to ONNX and set SEMDB_DETECTOR=onnx:FILE"
-        )
-    raise UsageError(f"no detector {spec!r}: write onnx:FILE (a Mask R-CNN) or recorded (masks of the recording)")
+        from semdb.perception.detectors.torchvision import TorchvisionDetector
+
+        return TorchvisionDetector(spec, settings)
+    raise UsageError(
+        f"no detector {spec!r}: write onnx:FILE (a Mask R-CNN), torchvision:maskrcnn_resnet50_fpn_v2 (or the path of a "
+        "checkpoint) or recorded (masks of the recording)"
+    )

@@ -16,3 +16,12 @@ COCO_91 = tuple(_NAMES.strip().replace("\n", "|").split("|"))
 
 NO_OBJECT = frozenset({"N/A", "background", "__background__"})
 """Names in a model's list of classes that stand for no object."""
+
+_INDOOR = """
+backpack|bed|bench|book|bottle|bowl|cell phone|chair|clock|couch|cup|dining table|handbag|keyboard|laptop
+microwave|mouse|oven|potted plant|refrigerator|remote|scissors|sink|suitcase|teddy bear|toaster|toilet|tv
+umbrella|vase|wine glass
+"""
+
+INDOOR = tuple(_INDOOR.strip().replace("\n", "|").split("|"))
+"""The indoor subset of COCO's classes: what stands or lies in a room for longer than a moment."""

@@ -28,8 +28,8 @@ class OnnxDetector:
 
     def __init__(self, spec: str, settings: Settings) -> None:
         path = resolve_onnx(spec, settings)
-        self._model = OnnxModel(path, settings.threads, _OUTPUTS)
-        self._classes = _class_names(self._model)
+        self._model = OnnxModel(path, settings.threads, _OUTPUTS, settings.device)
+        self.classes = _class_names(self._model)
         self._score_threshold = settings.score_threshold
         config = {"mask_threshold": MASK_THRESHOLD, "score_threshold": settings.score_threshold}
         self.info = ModelInfo("detector", f"onnx:{path.name}", file_sha256(path), canonical_json(config))
@@ -55,12 +55,12 @@ class OnnxDetector:
         return tuple(found)
 
     def _category(self, label: int) -> str:
-        if not 0 <= label < len(self._classes):
+        if not 0 <= label < len(self.classes):
             raise ModelError(
-                f"{self._model.path} gave label {label} but has {len(self._classes)} class names: "
+                f"{self._model.path} gave label {label} but has {len(self.classes)} class names: "
                 'set metadata_props["classes"] in the file to a JSON list with a name for every label'
             )
-        return self._classes[label]
+        return self.classes[label]
 
     def _check(
         self,

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from semdb.errors import ModelError, UsageError
+from semdb.errors import UsageError
 from semdb.perception.protocols import Encoder
 from semdb.settings import Settings
 
 
 def load_encoder(spec: str, settings: Settings) -> Encoder:
-    """The encoder of a `spec`: ``onnx:FILE`` or ``gist``.
+    """The encoder of a `spec`: ``onnx:FILE``, ``torchvision:NAME``, ``torchvision:PATH`` or ``gist``.
 
-    The network runs on ``settings.threads`` threads; their number does not change the result.
+    The network runs on ``settings.device``, on the CPU with ``settings.threads`` threads.
     Raises UsageError for a spec that is none, ModelError when its file is missing or is no encoder.
     """
     if spec == "gist":
@@ -22,8 +22,10 @@ def load_encoder(spec: str, settings: Settings) -> Encoder:
 
         return OnnxEncoder(spec, settings)
     if spec.startswith("torchvision:"):
-        raise ModelError(
-            f"{spec!r}: torch models come with `pip install semdb[torch]`, but this version of semdb runs encoders "
-            "only as onnx:FILE or gist; export the model to ONNX and set SEMDB_ENCODER=onnx:FILE"
-        )
-    raise UsageError(f"no encoder {spec!r}: write onnx:FILE (image to `embedding`) or gist (needs no file)")
+        from semdb.perception.encoders.torchvision import TorchvisionEncoder
+
+        return TorchvisionEncoder(spec, settings)
+    raise UsageError(
+        f"no encoder {spec!r}: write onnx:FILE (image to `embedding`), torchvision:resnet50-places365 (or resnet50, or "
+        "the path of a checkpoint) or gist (needs no file)"
+    )

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from semdb.errors import ModelError
 from semdb.perception.model_files import OnnxModel, canonical_json, file_sha256, resolve_onnx
@@ -19,7 +23,7 @@ class OnnxEncoder:
 
     def __init__(self, spec: str, settings: Settings) -> None:
         path = resolve_onnx(spec, settings)
-        self._model = OnnxModel(path, settings.threads, ("embedding",))
+        self._model = OnnxModel(path, settings.threads, ("embedding",), settings.device)
         config = canonical_json({"crop": CROP, "short_side": SHORT_SIDE})
         self.info = ModelInfo("encoder", f"onnx:{path.name}", file_sha256(path), config)
 
@@ -31,12 +35,17 @@ class OnnxEncoder:
         (embedding,) = self._model.run(centre_batch(image))
         if embedding.ndim != 2 or embedding.shape[0] != 1:
             raise ModelError(f"{self._model.path}: embedding is {embedding.shape} for one image; wanted is [1, d]")
-        vector = embedding[0].astype(np.float64)
-        norm = float(np.linalg.norm(vector))
-        if not np.isfinite(norm) or norm == 0:
-            raise ModelError(f"{self._model.path} gave an embedding that is zero or not finite: the file is damaged")
-        unit: Float32Array = (vector / norm).astype(np.float32)
-        return unit
+        return unit_vector(embedding[0], self._model.path)
+
+
+def unit_vector(embedding: npt.NDArray[np.floating[Any]], path: Path) -> Float32Array:
+    """`embedding` ``[d]`` at length 1, float32. Raises ModelError naming `path` when it is zero or not finite."""
+    vector = embedding.astype(np.float64)
+    norm = float(np.linalg.norm(vector))
+    if not np.isfinite(norm) or norm == 0:
+        raise ModelError(f"{path} gave an embedding that is zero or not finite: the file is damaged")
+    unit: Float32Array = (vector / norm).astype(np.float32)
+    return unit
 
 
 def centre_batch(image: ImageArray) -> Float32Array:

@@ -1,0 +1,206 @@
+"""What is made of a detector's output before it becomes rows: kept classes, clean masks, one detection per object.
+
+The same rules hold for every detector, for keyframes and for queries; they are part of the detector's provenance.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from semdb.errors import UsageError
+from semdb.perception.detectors.coco import INDOOR, NO_OBJECT
+from semdb.perception.model_files import canonical_json
+from semdb.perception.protocols import Detector
+from semdb.settings import Settings
+from semdb.types import BoolArray, Detection, Float32Array, ModelInfo
+
+_MARGIN, _MARGIN_MIN = 0.01, 3  # around a dynamic object, of the image's longer side and in pixels: masks are not exact
+
+
+@dataclass(frozen=True, slots=True)
+class MaskRules:
+    """How masks are cleaned and duplicates found; docs/models.md has what each does to two recordings.
+
+    `part_share`: connected parts of a mask smaller than this share of the largest are dropped (a table behind the
+    leg of a chair keeps both halves). `min_pixels`: so is a mask smaller than this. `depth_gap`: with depth, pixels
+    whose distance differs by more than this share from all of the mask's largest part without a jump of depth are
+    dropped (0: depth is not used). `duplicate_iou`: of two masks that overlap by this much the one with the lower
+    score is dropped when it has the same class, or less than `rival_share` of the other's score: two classes with
+    nearly the same score both stay, because from elsewhere the other one would win. `contained`: a mask with this
+    share inside one of its own class with a higher score is dropped.
+    """
+
+    part_share: float = 0.3
+    min_pixels: int = 64
+    depth_gap: float = 0.2
+    duplicate_iou: float = 0.7
+    rival_share: float = 0.8
+    contained: float = 0.85
+
+
+@dataclass(frozen=True, slots=True)
+class DetectionRules:
+    """`classes` are the only ones kept (None: all), together with the `dynamic` ones: objects that move.
+
+    No feature lies on a dynamic object, and it does not count where places are compared. `masks` None leaves masks as
+    they are: those that come with a recording are exact.
+    """
+
+    classes: tuple[str, ...] | None = None
+    dynamic: tuple[str, ...] = ()
+    masks: MaskRules | None = field(default_factory=MaskRules)
+
+    def apply(self, detections: Sequence[Detection], depth: Float32Array | None) -> tuple[Detection, ...]:
+        """The objects of a detector's `detections`, by descending score; `depth` ``[H, W]`` in metres, or None."""
+        kept = [d for d in detections if self.classes is None or d.category in (*self.classes, *self.dynamic)]
+        if self.masks is None:
+            return tuple(kept)
+        cleaned = [c for c in (clean_mask(d, depth, self.masks) for d in kept) if c is not None]
+        return without_duplicates(cleaned, self.masks)
+
+    def still(self, detections: Sequence[Detection]) -> BoolArray | None:
+        """Where features may lie ``[H, W]``: not on, nor close to, a dynamic object; None: all over."""
+        moving = [d.mask for d in detections if d.category in self.dynamic]
+        if not moving:
+            return None
+        covered = np.logical_or.reduce(moving).view(np.uint8)
+        size = 2 * max(_MARGIN_MIN, round(_MARGIN * max(covered.shape))) + 1
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+        free: BoolArray = cv2.dilate(covered, kernel) == 0
+        return free
+
+    def info(self, detector: ModelInfo) -> ModelInfo:
+        """Provenance of `detector` with these rules: other rules make rows that cannot be compared."""
+        config = {**json.loads(detector.config), **(asdict(self.masks) if self.masks is not None else {})}
+        if self.classes is not None:
+            config["classes"] = sorted(self.classes)
+        if self.dynamic:
+            config["dynamic"] = sorted(self.dynamic)
+        return replace(detector, config=canonical_json(config))
+
+
+def clean_mask(detection: Detection, depth: Float32Array | None, rules: MaskRules) -> Detection | None:
+    """`detection` with the main part of its mask and the box about that; None when too little is left.
+
+    A box changes only where its mask lost parts.
+    """
+    x, y, w, h = cv2.boundingRect(detection.mask.view(np.uint8))
+    inside = np.ascontiguousarray(detection.mask[y : y + h, x : x + w])
+    before = int(np.count_nonzero(inside))
+    part = _main_parts(inside, rules.part_share)
+    if depth is not None and rules.depth_gap > 0:
+        part = _at_one_depth(part, depth[y : y + h, x : x + w], rules.depth_gap)
+    area = int(np.count_nonzero(part))
+    if area < rules.min_pixels:
+        return None
+    if area == before:
+        return detection
+    mask = np.zeros_like(detection.mask)
+    mask[y : y + h, x : x + w] = part
+    px, py, pw, ph = cv2.boundingRect(part.view(np.uint8))
+    limits = np.array([x + px, y + py, x + px + pw - 1, y + py + ph - 1], dtype=np.float32)
+    old = detection.box
+    box = np.concatenate([np.maximum(old[:2], limits[:2]), np.minimum(old[2:], limits[2:])]).astype(np.float32)
+    return replace(detection, mask=mask, box=box)
+
+
+def without_duplicates(detections: Sequence[Detection], rules: MaskRules) -> tuple[Detection, ...]:
+    """`detections` by descending score, each object once (`MaskRules` says what is a duplicate); scores stay."""
+    kept: list[tuple[Detection, int]] = []
+    for candidate in sorted(detections, key=lambda detection: -detection.score):
+        area = int(np.count_nonzero(candidate.mask))
+        if not any(_is_duplicate(candidate, area, *other, rules) for other in kept):
+            kept.append((candidate, area))
+    return tuple(detection for detection, _ in kept)
+
+
+def _is_duplicate(candidate: Detection, area: int, other: Detection, other_area: int, rules: MaskRules) -> bool:
+    """Whether `candidate` is a second detection of what `other` is, which has at least its score."""
+    common = _common_pixels(candidate, other)
+    if common == 0:
+        return False
+    same_class = candidate.category == other.category
+    if common >= rules.duplicate_iou * (area + other_area - common):
+        return same_class or candidate.score < rules.rival_share * other.score
+    return same_class and common >= rules.contained * area
+
+
+def _common_pixels(a: Detection, b: Detection) -> int:
+    if a.box[0] > b.box[2] + 1 or b.box[0] > a.box[2] + 1 or a.box[1] > b.box[3] + 1 or b.box[1] > a.box[3] + 1:
+        return 0
+    return int(np.count_nonzero(a.mask & b.mask))
+
+
+def _main_parts(mask: BoolArray, share: float) -> BoolArray:
+    """The largest connected part of `mask` and those of at least `share` of its area."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=8)
+    if count <= 2:
+        return mask
+    areas = stats[1:, cv2.CC_STAT_AREA]
+    keep = np.concatenate([[False], areas >= share * areas.max()])
+    parts: BoolArray = keep[labels]
+    return parts
+
+
+def _at_one_depth(mask: BoolArray, depth: Float32Array, gap: float) -> BoolArray:
+    """`mask` without pixels that are further than `gap` before or behind its largest part without a jump of depth.
+
+    Pixels without depth stay: nothing speaks against them; so does a mask with little depth as a whole.
+    """
+    with np.errstate(invalid="ignore"):
+        known = mask & np.isfinite(depth) & (depth > 0)
+    if np.count_nonzero(known) < 0.2 * np.count_nonzero(mask):
+        return mask
+    log = np.log(np.where(known, depth, 1.0)).astype(np.float32)
+    smooth = known & ~_jumps(log, known)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(smooth.view(np.uint8), connectivity=4)
+    if count < 2:
+        return mask
+    main = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
+    low, high = np.percentile(log[labels == main], [2, 98])
+    far = known & ((log < low - gap) | (log > high + gap))
+    result: BoolArray = mask & ~far
+    return result
+
+
+def _jumps(log: Float32Array, known: BoolArray) -> npt.NDArray[np.bool_]:
+    """Pixels whose right or lower neighbour is nearer or farther by more than 5 percent."""
+    jumps = np.zeros(known.shape, dtype=np.bool_)
+    across = known[:, 1:] & known[:, :-1] & (np.abs(np.diff(log, axis=1)) > 0.05)
+    down = known[1:] & known[:-1] & (np.abs(np.diff(log, axis=0)) > 0.05)
+    jumps[:, :-1] |= across
+    jumps[:-1] |= down
+    return jumps
+
+
+def rules_of(settings: Settings, detector: Detector) -> DetectionRules:
+    """The rules of `settings` for `detector`.
+
+    Raises UsageError for a list of classes that names none, or one that `detector` does not know.
+    """
+    classes = None if settings.classes in (None, "all") else _parse_classes(settings.classes, "classes", detector)
+    dynamic = () if settings.dynamic in (None, "none") else _parse_classes(settings.dynamic, "dynamic", detector)
+    return DetectionRules(classes, dynamic, MaskRules() if detector.classes is not None else None)
+
+
+def _parse_classes(text: str | None, name: str, detector: Detector) -> tuple[str, ...]:
+    """``"chair, cup"`` as names, each once; ``indoor`` stands for those of `INDOOR` that the detector knows."""
+    known = detector.classes
+    names: dict[str, None] = {}
+    for word in (part.strip() for part in (text or "").split(",")):
+        if word == "indoor":
+            names.update(dict.fromkeys(c for c in INDOOR if known is None or c in known))
+        elif word and known is not None and word not in known:
+            shown = ", ".join(sorted(set(known) - NO_OBJECT))
+            raise UsageError(f"--{name} {word} (SEMDB_{name.upper()}): {detector.info.name} knows only {shown}")
+        elif word:
+            names[word] = None
+    if not names:
+        raise UsageError(f"--{name} {text!r} (SEMDB_{name.upper()}) names no class: write names divided by commas")
+    return tuple(names)
