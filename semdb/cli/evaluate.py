@@ -1,7 +1,8 @@
-"""`semdb evaluate`: how well images are localized in a recording's own keyframes."""
+"""`semdb evaluate`: how well images are localized in the keyframes of a recording, or of other recordings."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,21 +12,43 @@ from semdb.cli.options import CameraOption, Overrides, settings_options
 
 if TYPE_CHECKING:
     from semdb.evaluation.metrics import EvaluationResult
+    from semdb.evaluation.runner import EvaluateOptions, Outcome
     from semdb.settings import Settings
 
 
 @settings_options(models=True)
 def command(
-    paths: Annotated[list[Path], typer.Argument(metavar="PATH...", help="Folders of recordings.")],
     overrides: Overrides,
+    paths: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[PATH...]", help="Folders of recordings; scenes of 7-Scenes for --protocol split."),
+    ] = None,
+    protocol: Annotated[
+        str,
+        typer.Option(
+            "--protocol", metavar="paper|split", help="Keyframes and queries of one recording, or of different ones."
+        ),
+    ] = "paper",
+    map_from: Annotated[
+        list[Path] | None,
+        typer.Option("--map-from", metavar="FOLDER", help="Keyframes come from this recording; may be repeated."),
+    ] = None,
+    query_from: Annotated[
+        list[Path] | None,
+        typer.Option("--query-from", metavar="FOLDER", help="Queries come from this recording; may be repeated."),
+    ] = None,
     method: Annotated[
         list[str] | None,
         typer.Option(
             "--method",
             metavar="NAME",
-            help="semdb (default), cnn, paper, chen, sift-reference or oracle; several on the same queries.",
+            help="semdb (default), cnn, paper, chen, sift-reference, oracle, colmap; NAME+depth gives queries their "
+            "depth; several on the same queries.",
         ),
     ] = None,
+    ablation: Annotated[
+        bool, typer.Option("--ablation", help="Print what filter, cascade and background keypoints bring.")
+    ] = False,
     keyframes: Annotated[
         str | None,
         typer.Option("--keyframes", metavar="N[,N...]", help="Exactly N keyframes; several numbers run one by one."),
@@ -39,58 +62,140 @@ def command(
     query_depth: Annotated[
         bool, typer.Option("--query-depth", help="Give the queries their depth images too, not the colour alone.")
     ] = False,
+    truth: Annotated[
+        str,
+        typer.Option(
+            "--truth", metavar="given|refined|both", help="Poses of the recording, or refined by structure from motion."
+        ),
+    ] = "given",
     camera: CameraOption = None,
     json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the results as JSON.")] = None,
     report: Annotated[
         Path | None,
-        typer.Option("--report", metavar="DIR", help="Write a page with tables and plots, a CSV of queries, JSON."),
+        typer.Option("--report", metavar="DIR", help="Write a page with tables, plots and pictures, a CSV, JSON."),
+    ] = None,
+    trajectories: Annotated[
+        Path | None,
+        typer.Option("--trajectories", metavar="DIR", help="Write estimated and true poses in TUM's format (evo)."),
     ] = None,
 ) -> None:
-    """Protocol `paper`: keyframes into a database of its own, the other frames as queries, errors against the truth."""
+    """Keyframes into a database of its own, other frames as queries, errors against the true poses."""
     from semdb.cli.progress import StagedProgress, say
-    from semdb.evaluation.runner import EvaluateOptions, evaluate
+    from semdb.evaluation.methods import ABLATION
+    from semdb.evaluation.runner import EvaluateOptions, evaluate_each
+    from semdb.evaluation.worst import WORST
     from semdb.recordings import parse_camera
 
     settings = overrides.settings()
-    check_outputs(json_file, report)
-    results: list[EvaluationResult] = []
-    for count in parse_counts(keyframes):
-        options = EvaluateOptions(
-            methods=tuple(method or ["semdb"]),
-            keyframes=count,
-            max_queries=max_queries,
-            coarse=coarse,
-            camera=None if camera is None else parse_camera(camera),
-            query_depth=query_depth,
-        )
-        with StagedProgress() as progress:
-            results += evaluate(paths, settings, options, progress=progress.update, say=say)
-    show(results)
-    if json_file is not None:
-        from semdb.evaluation.metrics import write_json
+    names = list(method or []) + [name for _, _, name in ABLATION if ablation]
+    options = EvaluateOptions(
+        methods=tuple(dict.fromkeys(names or ["semdb"])),
+        keyframes=tuple(parse_counts(keyframes)),
+        max_queries=max_queries,
+        coarse=coarse,
+        camera=None if camera is None else parse_camera(camera),
+        query_depth=query_depth,
+        protocol=protocol,
+        map_from=tuple(map_from or ()),
+        query_from=tuple(query_from or ()),
+        truth=truth,
+        pictures=WORST if report is not None else 0,
+    )
+    check_outputs(json_file, report, trajectories)
+    output = Outputs(json_file, report, trajectories, used_settings(settings, options), expects_several(paths, options))
+    with StagedProgress() as progress:
+        for outcome in evaluate_each(paths or [], settings, options, progress=progress.update, say=say):
+            output.add(outcome)
+    output.finish(ablation)
 
-        write_json(json_file, results)
-    if report is not None:
+
+@dataclass
+class Outputs:
+    """Writes what is there after every recording, so that a later failure, or a kill, costs only what was not done."""
+
+    json_file: Path | None
+    report: Path | None
+    trajectories: Path | None
+    settings: dict[str, str]
+    several: bool
+    results: list[EvaluationResult] = field(default_factory=list)
+    failed: list[Outcome] = field(default_factory=list)
+
+    def add(self, outcome: Outcome) -> None:
+        from semdb.cli.progress import say
+
+        if outcome.error is not None:
+            self.failed.append(outcome)
+            if outcome.results or self.results:
+                say(f"{outcome.name}: not evaluated; the results so far are kept")
+            return
+        self.results += outcome.results
+        self._write()
+
+    def _write(self) -> None:
+        from semdb.evaluation.files import write_json
         from semdb.evaluation.report import write_report
+        from semdb.evaluation.trajectories import write_trajectories
 
-        say(f"wrote {write_report(report, results, settings=used_settings(settings, coarse, query_depth))}")
+        if self.json_file is not None:
+            write_json(self.json_file, self.results, several=self.several or len(self.results) > 1)
+        if self.trajectories is not None:
+            write_trajectories(self.trajectories, self.results)
+        if self.report is not None:
+            failures = {outcome.name: str(outcome.error) for outcome in self.failed}
+            write_report(self.report, self.results, settings=self.settings, failures=failures)
+
+    def finish(self, ablation: bool) -> None:
+        """The tables on the terminal. Raises the error where nothing succeeded, exits with 1 where something failed."""
+        from semdb.cli.progress import say
+
+        if not self.results:
+            raise first_error(self.failed)
+        show(self.results, ablation)
+        if self.failed:
+            self._write()  # the page names what failed after the last success, too
+        if self.report is not None:
+            say(f"wrote {self.report / 'index.html'}")
+        if self.trajectories is not None:
+            say(f"wrote trajectories to {self.trajectories}; evo_ape tum NAME-truth.txt NAME.txt reads them")
+        for outcome in self.failed:
+            say(f"not evaluated: {outcome.name}: {outcome.error}")
+        if self.failed:
+            raise typer.Exit(1)
 
 
-def check_outputs(json_file: Path | None, report: Path | None) -> None:
+def first_error(failed: list[Outcome]) -> Exception:
+    """The error to end with where nothing succeeded."""
+    from semdb.errors import UsageError
+
+    errors = [outcome.error for outcome in failed if outcome.error is not None]
+    return errors[0] if errors else UsageError("nothing was evaluated")
+
+
+def expects_several(paths: list[Path] | None, options: EvaluateOptions) -> bool:
+    """Whether the JSON file is a list from the first result on."""
+    from semdb.evaluation.runner import BOTH
+
+    counts = len(paths or [1]) * len(options.methods) * len(options.keyframes)
+    return counts > 1 or options.truth == BOTH
+
+
+def check_outputs(json_file: Path | None, report: Path | None, trajectories: Path | None = None) -> None:
     """Raises UsageError where the results could not be written in the end, before anything is computed."""
     import os
 
     from semdb.errors import UsageError
 
     if json_file is not None:
-        target = json_file if json_file.exists() else json_file.parent
+        target = json_file if json_file.exists() and not json_file.is_file() else json_file.parent
         if json_file.is_dir() or not target.exists() or not os.access(target, os.W_OK):
             raise UsageError(f"--json {json_file}: cannot be written there; name a file in a folder that exists")
-    if report is not None:
+    for option, folder in (("--report", report), ("--trajectories", trajectories)):
         try:
-            report.mkdir(parents=True, exist_ok=True)
+            if folder is not None:
+                folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise UsageError(f"--report {report}: the folder cannot be made: {error.strerror}") from error
+            raise UsageError(f"{option} {folder}: the folder cannot be made: {error.strerror}") from error
 
 
 def parse_counts(text: str | None) -> list[int | None]:
@@ -105,23 +210,25 @@ def parse_counts(text: str | None) -> list[int | None]:
         raise UsageError(f"--keyframes {text}: a number is needed, or several with commas between") from None
 
 
-def show(results: list[EvaluationResult]) -> None:
-    """The table on the terminal. Lines are as long as they need to be where stdout is no terminal."""
+def show(results: list[EvaluationResult], ablation: bool) -> None:
+    """The tables on the terminal. Lines are as long as they need to be where stdout is no terminal."""
     import sys
 
     from rich.console import Console
 
-    from semdb.evaluation.tables import by_keyframes, results_table
+    from semdb.evaluation.tables import by_keyframes, terminal_tables
 
     console = Console() if sys.stdout.isatty() else Console(width=220)
-    console.print(results_table(by_keyframes(results)))
+    for table in terminal_tables(by_keyframes(results), ablation=ablation):
+        console.print(table)
 
 
-def used_settings(settings: Settings, coarse: str, query_depth: bool) -> dict[str, str]:
+def used_settings(settings: Settings, options: EvaluateOptions) -> dict[str, str]:
     """What a report says of the run; no path, no password."""
     return {
-        "coarse": coarse,
-        "query depth": "yes" if query_depth else "no",
+        "coarse": options.coarse,
+        "query depth": "yes" if options.query_depth else "no",
+        "truth": options.truth,
         "database": settings.database_url.partition(":")[0],
         "score threshold": f"{settings.score_threshold:g}",
         "keypoints per image": f"{settings.max_keypoints} at most",

@@ -95,6 +95,7 @@ def estimate_pose(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Keyframe:
+    recording: str
     index: int
     pose: FloatArray  # [4, 4] world_from_camera
     xy: Float32Array  # [n, 2] pixels as seen
@@ -106,8 +107,9 @@ class SiftReference:
     """Method `sift-reference`: the five keyframes nearest in *true* pose, SIFT, joined pairs, LO-RANSAC.
 
     It is told the true pose of the query to choose keyframes, so retrieval is perfect; the pose itself is
-    estimated from pixels alone. Keyframes are described once, when the object is made. `keyframes` may be lazy.
-    Keyframes without a pose or depth cannot serve and raise FrameError; no keyframe at all raises UsageError.
+    estimated from pixels alone. Keyframes are described once, when the object is made. `keyframes` are (name of
+    the recording, frame), and may be lazy. Keyframes without a pose or depth cannot serve and raise FrameError;
+    no keyframe at all raises UsageError.
     """
 
     models = (
@@ -116,39 +118,44 @@ class SiftReference:
 
     def __init__(
         self,
-        keyframes: Iterable[Frame],
+        keyframes: Iterable[tuple[str, Frame]],
         *,
         map_name: str = "",
-        recording: str = "",
         progress: Callable[[int, int], None] | None = None,
     ) -> None:
         self._map_name = map_name
-        self._recording = recording
         self._keyframes: list[_Keyframe] = []
         total = len(keyframes) if isinstance(keyframes, Sequence) else 0
-        for number, frame in enumerate(keyframes, start=1):
-            self._keyframes.append(_describe_keyframe(frame))
+        for number, (name, frame) in enumerate(keyframes, start=1):
+            self._keyframes.append(_describe_keyframe(name, frame))
             if progress is not None:
                 progress(number, max(total, number))
         if not self._keyframes:
             raise UsageError("sift-reference needs at least one keyframe")
-        self._poses = np.stack([keyframe.pose for keyframe in self._keyframes])
+        self.poses = np.stack([keyframe.pose for keyframe in self._keyframes])
 
     def __len__(self) -> int:
         """How many keyframes it has."""
         return len(self._keyframes)
 
+    @property
+    def names(self) -> list[tuple[str, int]]:
+        """Recording and frame index of every keyframe."""
+        return [(keyframe.recording, keyframe.index) for keyframe in self._keyframes]
+
     def localize(self, frame: Frame) -> Localization:
         """The pose of `frame`, or verdict `failed` below 12 inliers. There is no confidence (NaN) or covariance.
 
-        Candidates name keyframes by frame index. Raises FrameError when `frame` has no true pose to choose by.
+        Ids of candidates are positions among the keyframes. Raises FrameError when `frame` has no true pose to
+        choose by.
         """
         if frame.world_from_camera is None:
             raise FrameError(f"{frame.name}: sift-reference chooses keyframes by the true pose, and there is none")
         started = time.perf_counter()
         xy, descriptors = root_sift(frame.image)
         described = time.perf_counter()
-        chosen = [self._keyframes[i] for i in nearest_in_pose(frame.world_from_camera, self._poses)]
+        positions = nearest_in_pose(frame.world_from_camera, self.poses)
+        chosen = [self._keyframes[i] for i in positions]
         pairs = [ratio_matches(descriptors, keyframe.descriptors) for keyframe in chosen]
         rows = np.concatenate([pair[:, 0] for pair in pairs])
         owners = np.repeat(np.arange(len(chosen)), [len(pair) for pair in pairs])
@@ -170,8 +177,8 @@ class SiftReference:
             inliers=int(inliers.sum()),
             stage=STAGE_TRUE_POSE,
             candidates=tuple(
-                Candidate(keyframe.index, self._recording, keyframe.index, float("nan"), float("nan"), int(count))
-                for keyframe, count in zip(chosen, counts, strict=True)
+                Candidate(position, keyframe.recording, keyframe.index, float("nan"), float("nan"), int(count))
+                for position, keyframe, count in zip(positions, chosen, counts, strict=True)
             ),
             ranked_share=0.0,
             keyframes_matched=len(chosen),
@@ -182,13 +189,13 @@ class SiftReference:
                 "pose": 1e3 * (solved - matched),
                 "total": 1e3 * (solved - started),
             },
-            best_keyframe_id=chosen[best].index,
+            best_keyframe_id=positions[best],
             query_xy=xy[rows][shown],
             keyframe_xy=keyframe_xy[shown],
         )
 
 
-def _describe_keyframe(frame: Frame) -> _Keyframe:
+def _describe_keyframe(recording: str, frame: Frame) -> _Keyframe:
     if frame.world_from_camera is None or frame.depth is None:
         missing = "pose" if frame.world_from_camera is None else "depth"
         raise FrameError(f"{frame.name}: a keyframe of sift-reference needs a {missing}, and this frame has none")
@@ -196,4 +203,4 @@ def _describe_keyframe(frame: Frame) -> _Keyframe:
     points = points_at(xy, frame.depth, frame.camera)
     good = np.isfinite(points).all(axis=1)
     world = transform_points(frame.world_from_camera, points[good])
-    return _Keyframe(frame.index, frame.world_from_camera, xy[good], descriptors[good], world)
+    return _Keyframe(recording, frame.index, frame.world_from_camera, xy[good], descriptors[good], world)

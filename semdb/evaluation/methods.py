@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from semdb.errors import UsageError
 from semdb.localization.coarse import CoarseOptions
@@ -14,6 +14,9 @@ from semdb.localization.verdict import VerdictOptions
 SEMDB = "semdb"
 SIFT_REFERENCE = "sift-reference"
 ORACLE = "oracle"
+COLMAP = "colmap"
+WITH_DEPTH = "+depth"  # after a method's name: its queries come with their depth images
+COLOUR_ONLY = (SIFT_REFERENCE, COLMAP)
 
 # As the papers accept a pose: enough inliers, nothing else is asked.
 _COUNT_ONLY = VerdictOptions(
@@ -31,13 +34,18 @@ _COUNT_ONLY = VerdictOptions(
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """`features` None takes those of the settings."""
+    """`features` None takes those of the settings; `query_depth` gives queries their depth images."""
 
     name: str
     summary: str
     options: LocalizerOptions = field(default_factory=LocalizerOptions)
     features: str | None = None
+    query_depth: bool = False
 
+
+# The whole budget of the default cascade, 10 keyframes, spent on the filtered set.
+_HARD = CoarseOptions(cascade=False, filtered_batches=(1, 2, 3, 4))
+_ON_OBJECTS = PoseOptions(matching=MatchingOptions(evidence=Evidence.OBJECTS), guided=False)
 
 METHODS = {
     method.name: method
@@ -53,7 +61,7 @@ METHODS = {
             "the paper as written: hard filter, best cosine, keypoints on objects of the same class only",
             LocalizerOptions(
                 coarse=CoarseOptions(cascade=False, filtered_batches=(1,)),
-                pose=PoseOptions(matching=MatchingOptions(evidence=Evidence.OBJECTS), guided=False),
+                pose=_ON_OBJECTS,
                 verdict=_COUNT_ONLY,
                 neighbours=0,
                 twins=0,
@@ -73,12 +81,45 @@ METHODS = {
         ),
         Method(SIFT_REFERENCE, "the five keyframes nearest in true pose, SIFT 1500, ratio 0.85, LO-RANSAC"),
         Method(ORACLE, "semdb's fine step on the five keyframes nearest in true pose"),
+        Method(COLMAP, "COLMAP: SIFT, all keyframes matched, points triangulated with known poses, LO-RANSAC"),
+        Method("hard", "as semdb with the hard class filter alone", LocalizerOptions(coarse=_HARD)),
+        Method(
+            "cnn-objects",
+            "as cnn with keypoints on objects of the same class only",
+            LocalizerOptions(coarse=CoarseOptions(use_classes=False), pose=_ON_OBJECTS),
+        ),
+        Method(
+            "hard-objects",
+            "as hard with keypoints on objects of the same class only",
+            LocalizerOptions(coarse=_HARD, pose=_ON_OBJECTS),
+        ),
+        Method(
+            "semdb-objects",
+            "as semdb with keypoints on objects of the same class only",
+            LocalizerOptions(pose=_ON_OBJECTS),
+        ),
     )
 }
 
 
+# What each layer brings: (filter, keypoints, method), in the order of the table of `--ablation`.
+ABLATION = (
+    ("no filter", "all", "cnn"),
+    ("hard filter", "all", "hard"),
+    ("cascade", "all", SEMDB),
+    ("no filter", "on objects", "cnn-objects"),
+    ("hard filter", "on objects", "hard-objects"),
+    ("cascade", "on objects", "semdb-objects"),
+)
+
+
 def method_named(name: str) -> Method:
-    """Raises UsageError that names the methods there are."""
-    if name not in METHODS:
-        raise UsageError(f"--method {name}: known are {', '.join(METHODS)}")
-    return METHODS[name]
+    """The method `name`, or ``NAME+depth``. Raises UsageError that names the methods there are."""
+    plain = name.removesuffix(WITH_DEPTH)
+    if plain not in METHODS:
+        raise UsageError(f"--method {name}: known are {', '.join(METHODS)}, and with query depth NAME{WITH_DEPTH}")
+    if name == plain:
+        return METHODS[plain]
+    if plain in COLOUR_ONLY:
+        raise UsageError(f"--method {name}: {plain} has no use for the depth of queries")
+    return replace(METHODS[plain], name=name, query_depth=True)

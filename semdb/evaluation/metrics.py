@@ -1,22 +1,19 @@
-"""What an evaluation measures: one value per query, one summary per run, and their JSON and CSV forms.
+"""What an evaluation measures: one value per query, one summary per run.
 
-The definitions and every JSON key are documented in docs/evaluation.md. Values only: nothing here runs anything.
+The definitions are documented in docs/evaluation.md. Values only: nothing here runs anything.
 """
 
 from __future__ import annotations
 
-import csv
-import json
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from semdb.errors import UsageError
+from semdb.evaluation.refined_truth import Disagreement
+from semdb.evaluation.retrieval import Reach, Retrieval, retrieval_figures
 from semdb.geometry import pose_error
 from semdb.types import FloatArray, Localization, ModelInfo, Verdict
 
@@ -38,8 +35,11 @@ TIMING_STAGES = ("decode", "detect", "encode", "features", "filter", "rank", "ma
 class QueryResult:
     """What became of one query.
 
-    The errors are None where there is no pose (verdict `failed`) or no true pose. `candidate` is the frame index
-    of the best keyframe. The two poses ``[4, 4]`` are for plots and are not written to files.
+    The errors are None where there is no pose (verdict `failed`) or no true pose; `other_*` are those against the
+    other of two truths. `candidate` is the frame index of the best keyframe, in `candidate_recording`.
+    `keyframe_in_reach`, `retrieval_rank` and `nearest_keyframe_*` are those of `semdb.evaluation.retrieval.Reach`;
+    `retrieves` is False for methods that are told their keyframes. The two poses ``[4, 4]`` are for plots and are
+    written to trajectories only.
     """
 
     frame: str
@@ -55,6 +55,17 @@ class QueryResult:
     keyframes_matched: int
     timing_ms: Mapping[str, float] = field(default_factory=dict)
     reason: str = ""
+    recording: str = ""
+    timestamp_ns: int | None = None
+    candidate_recording: str | None = None
+    keyframe_in_reach: bool | None = None
+    retrieval_rank: int | None = None
+    nearest_keyframe_m: float | None = None
+    nearest_keyframe_deg: float | None = None
+    sharpness: float | None = None
+    other_translation_m: float | None = None
+    other_rotation_deg: float | None = None
+    retrieves: bool = False
     world_from_camera: FloatArray | None = field(default=None, compare=False, repr=False)
     true_world_from_camera: FloatArray | None = field(default=None, compare=False, repr=False)
 
@@ -67,6 +78,13 @@ class QueryResult:
         """Reported as localized, but off by more than 0.25 m or 5 degrees."""
         return self.is_localized and not self.is_within(FALSE_TRANSLATION_M, FALSE_ROTATION_DEG)
 
+    @property
+    def has_right_pose(self) -> bool:
+        """A pose within 0.25 m and 5 degrees, whatever the verdict."""
+        if self.translation_m is None or self.rotation_deg is None:
+            return False
+        return self.translation_m <= FALSE_TRANSLATION_M and self.rotation_deg <= FALSE_ROTATION_DEG
+
     def is_within(self, translation_m: float, rotation_deg: float) -> bool:
         """Localized, and off by no more than the two limits."""
         if not self.is_localized or self.translation_m is None or self.rotation_deg is None:
@@ -75,8 +93,25 @@ class QueryResult:
 
 
 @dataclass(frozen=True, slots=True)
+class Errors:
+    """Figures of errors against one truth: medians and means over localized queries, recalls over all."""
+
+    false_localizations: int
+    median_translation_m: float | None
+    median_rotation_deg: float | None
+    mean_translation_m: float | None
+    mean_rotation_deg: float | None
+    recall: Mapping[str, float | None]
+
+
+@dataclass(frozen=True, slots=True)
 class EvaluationResult:
-    """One method on one recording. The fields are the JSON keys; all shares are 0..1; None where undefined."""
+    """One method on one recording. The fields are the JSON keys; all shares are 0..1; None where undefined.
+
+    `truth` is ``given`` or ``refined``: whose poses the map and the errors are of. `other_errors` are the errors of
+    the same answers against the other truth, where it is known. `pictures` are JPEG files by recording and frame
+    index and are for reports only.
+    """
 
     recording: str
     protocol: str
@@ -98,6 +133,16 @@ class EvaluationResult:
     stages: Mapping[str, int]
     timing_ms: Mapping[str, Mapping[str, float | None]]
     per_query: tuple[QueryResult, ...]
+    sequence: str | None = None
+    keyframes_asked: int | None = None
+    query_depth: bool = False
+    map_recordings: tuple[str, ...] = ()
+    query_recordings: tuple[str, ...] = ()
+    retrieval: Retrieval | None = None
+    truth: str = "given"
+    other_errors: Errors | None = None
+    disagreement: Disagreement | None = None
+    pictures: Mapping[tuple[str, int], bytes] = field(default_factory=dict, compare=False, repr=False)
 
 
 def query_result(
@@ -107,6 +152,8 @@ def query_result(
     true_world_from_camera: FloatArray | None,
     *,
     timing_ms: Mapping[str, float] | None = None,
+    recording: str = "",
+    timestamp_ns: int | None = None,
 ) -> QueryResult:
     """The result of one query from what a localizer answered and the true pose ``[4, 4]``.
 
@@ -130,15 +177,64 @@ def query_result(
         rotation_deg=rotation,
         candidate=None if best is None else best.frame_index,
         inliers=localization.inliers,
-        confidence=_finite(localization.confidence),
+        confidence=finite(localization.confidence),
         stage=localization.stage,
-        ranked_share=_finite(localization.ranked_share),
+        ranked_share=finite(localization.ranked_share),
         keyframes_matched=localization.keyframes_matched,
         timing_ms={**localization.timing_ms, **(timing_ms or {})},
         reason=localization.reason,
+        recording=recording,
+        timestamp_ns=timestamp_ns,
+        candidate_recording=None if best is None else best.recording,
         world_from_camera=estimate,
         true_world_from_camera=true_world_from_camera,
     )
+
+
+def with_reach(query: QueryResult, found: Reach, *, retrieves: bool) -> QueryResult:
+    """The query with what the map had of its place, and where the method ranked it."""
+    return replace(
+        query,
+        keyframe_in_reach=found.reachable,
+        retrieval_rank=found.rank,
+        nearest_keyframe_m=found.nearest_translation_m,
+        nearest_keyframe_deg=found.nearest_rotation_deg,
+        retrieves=retrieves,
+    )
+
+
+def with_other_truth(query: QueryResult, true_world_from_camera: FloatArray | None) -> QueryResult:
+    """The query with its errors against a second truth ``[4, 4]`` too."""
+    if true_world_from_camera is None or query.world_from_camera is None:
+        return query
+    metres, degrees = pose_error(query.world_from_camera, true_world_from_camera)
+    return replace(query, other_translation_m=metres, other_rotation_deg=degrees)
+
+
+def error_figures(queries: Sequence[QueryResult]) -> Errors:
+    """Medians and means of errors over localized queries, recalls over all queries; None where undefined."""
+    localized = [query for query in queries if query.is_localized]
+    translations = [query.translation_m for query in localized]
+    rotations = [query.rotation_deg for query in localized]
+    return Errors(
+        false_localizations=sum(query.is_false for query in queries),
+        median_translation_m=_median(translations),
+        median_rotation_deg=_median(rotations),
+        mean_translation_m=_mean(translations),
+        mean_rotation_deg=_mean(rotations),
+        recall={name: _recall(queries, limits) for name, limits in RECALL_LIMITS.items()},
+    )
+
+
+def other_error_figures(queries: Sequence[QueryResult]) -> Errors | None:
+    """`error_figures` against the other truth, over the queries that it knows; None where it knows none."""
+    swapped = [
+        replace(query, translation_m=query.other_translation_m, rotation_deg=query.other_rotation_deg)
+        for query in queries
+        if not query.is_localized or query.other_translation_m is not None
+    ]
+    known = any(query.other_translation_m is not None for query in queries)
+    return error_figures(swapped) if known else None
 
 
 def summarise(
@@ -158,9 +254,9 @@ def summarise(
     that gave the answer, a failure included.
     """
     results = tuple(queries)
-    localized = [query for query in results if query.is_localized]
-    translations = [query.translation_m for query in localized]
-    rotations = [query.rotation_deg for query in localized]
+    localized = sum(query.is_localized for query in results)
+    errors = error_figures(results)
+    known = [query for query in results if query.retrieves and query.keyframe_in_reach is not None]
     return EvaluationResult(
         recording=recording,
         protocol=protocol,
@@ -169,118 +265,26 @@ def summarise(
         frames=frames,
         keyframes=keyframes,
         queries=len(results),
-        localized=len(localized),
-        false_localizations=sum(query.is_false for query in results),
-        success_rate=len(localized) / len(results) if results else None,
-        median_translation_m=_median(translations),
-        median_rotation_deg=_median(rotations),
-        mean_translation_m=_mean(translations),
-        mean_rotation_deg=_mean(rotations),
-        recall={name: _recall(results, limits) for name, limits in RECALL_LIMITS.items()},
+        localized=localized,
+        false_localizations=errors.false_localizations,
+        success_rate=localized / len(results) if results else None,
+        median_translation_m=errors.median_translation_m,
+        median_rotation_deg=errors.median_rotation_deg,
+        mean_translation_m=errors.mean_translation_m,
+        mean_rotation_deg=errors.mean_rotation_deg,
+        recall=errors.recall,
         ranked_share=_median(query.ranked_share for query in results),
         keyframes_matched=_median(float(query.keyframes_matched) for query in results),
         stages=dict(Counter(query.stage for query in results if query.stage)),
         timing_ms=_timing(results),
         per_query=results,
+        retrieval=retrieval_figures(
+            [bool(query.keyframe_in_reach) for query in known], [query.retrieval_rank for query in known]
+        )
+        if known
+        else None,
+        other_errors=other_error_figures(results),
     )
-
-
-def to_json(result: EvaluationResult) -> dict[str, Any]:
-    """The result as plain JSON values under the documented keys; never NaN or infinity."""
-    return {
-        "recording": result.recording,
-        "protocol": result.protocol,
-        "method": result.method,
-        "models": {model.role: _model_to_json(model) for model in result.models},
-        "frames": result.frames,
-        "keyframes": result.keyframes,
-        "queries": result.queries,
-        "localized": result.localized,
-        "false_localizations": result.false_localizations,
-        "success_rate": result.success_rate,
-        "median_translation_m": result.median_translation_m,
-        "median_rotation_deg": result.median_rotation_deg,
-        "mean_translation_m": result.mean_translation_m,
-        "mean_rotation_deg": result.mean_rotation_deg,
-        "recall": dict(result.recall),
-        "ranked_share": result.ranked_share,
-        "keyframes_matched": result.keyframes_matched,
-        "stages": dict(result.stages),
-        "timing_ms": {stage: dict(values) for stage, values in result.timing_ms.items()},
-        "per_query": [_query_to_json(query) for query in result.per_query],
-    }
-
-
-def write_json(path: Path, results: Sequence[EvaluationResult]) -> None:
-    """One object for one result, a list of them for several. Raises UsageError where `path` cannot be written."""
-    objects = [to_json(result) for result in results]
-    text = json.dumps(objects[0] if len(objects) == 1 else objects, indent=2, allow_nan=False)
-    try:
-        path.write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"the results cannot be written to {path}: {error.strerror}") from error
-
-
-CSV_COLUMNS = (
-    "recording",
-    "method",
-    "keyframes",
-    "frame",
-    "frame_index",
-    "verdict",
-    "translation_m",
-    "rotation_deg",
-    "candidate",
-    "inliers",
-    "confidence",
-    "stage",
-    "ranked_share",
-    "keyframes_matched",
-    "total_ms",
-    "reason",
-)
-
-
-def write_queries_csv(path: Path, results: Sequence[EvaluationResult]) -> None:
-    """One row per query of every result; an empty cell where a value is undefined.
-
-    Raises UsageError where `path` cannot be written.
-    """
-    try:
-        with path.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, CSV_COLUMNS, extrasaction="ignore", lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(row for result in results for row in _csv_rows(result))
-    except OSError as error:
-        raise UsageError(f"the queries cannot be written to {path}: {error.strerror}") from error
-
-
-def _csv_rows(result: EvaluationResult) -> Iterator[dict[str, Any]]:
-    shared = {"recording": result.recording, "method": result.method, "keyframes": result.keyframes}
-    for query in result.per_query:
-        yield {**_query_to_json(query), **shared, "total_ms": _finite(query.timing_ms.get("total"))}
-
-
-def _query_to_json(query: QueryResult) -> dict[str, Any]:
-    return {
-        "frame": query.frame,
-        "frame_index": query.frame_index,
-        "verdict": str(query.verdict),
-        "translation_m": _finite(query.translation_m),
-        "rotation_deg": _finite(query.rotation_deg),
-        "candidate": query.candidate,
-        "inliers": query.inliers,
-        "confidence": _finite(query.confidence),
-        "stage": query.stage,
-        "ranked_share": _finite(query.ranked_share),
-        "keyframes_matched": query.keyframes_matched,
-        "timing_ms": {stage: _finite(value) for stage, value in query.timing_ms.items()},
-        "reason": query.reason,
-    }
-
-
-def _model_to_json(model: ModelInfo) -> dict[str, Any]:
-    return {"name": model.name, "sha256": model.sha256, "config": json.loads(model.config)}
 
 
 def _timing(queries: Sequence[QueryResult]) -> dict[str, dict[str, float | None]]:
@@ -299,12 +303,12 @@ def _recall(queries: Sequence[QueryResult], limits: tuple[float, float]) -> floa
     return sum(query.is_within(*limits) for query in queries) / len(queries) if queries else None
 
 
-def _finite(value: float | None) -> float | None:
+def finite(value: float | None) -> float | None:
     return float(value) if value is not None and math.isfinite(value) else None
 
 
 def _finite_values(values: Iterable[float | None]) -> list[float]:
-    return [value for value in map(_finite, values) if value is not None]
+    return [value for value in map(finite, values) if value is not None]
 
 
 def _median(values: Iterable[float | None]) -> float | None:

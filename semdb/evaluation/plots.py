@@ -13,18 +13,17 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter, PercentFormatter
 
-from semdb.evaluation.metrics import FALSE_TRANSLATION_M, EvaluationResult, QueryResult
+from semdb.evaluation.metrics import FALSE_TRANSLATION_M, TIMING_STAGES, EvaluationResult, QueryResult
+from semdb.evaluation.published import PAPER_ROTATION, PAPER_TRANSLATION
 from semdb.pictures import FAINT, INK, VERDICT_COLOURS
 from semdb.top_view import horizontal_axes
 from semdb.types import FloatArray, Verdict
 
 TRANSLATION_RANGE_M = 0.5
 ROTATION_RANGE_DEG = 10.0
-# what the paper's Figures 6 and 7 show: above 90 % of queries within 0.3 m, over 80 % within 2.5 degrees
-PAPER_TRANSLATION = (0.3, 0.9)
-PAPER_ROTATION = (2.5, 0.8)
 # Okabe and Ito's palette: told apart by readers with any colour vision
 SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+STAGE_COLOURS = ("#c9d0d8", "#0072B2", "#56B4E9", "#009E73", "#F0E442", "#E69F00", "#D55E00", "#CC79A7")
 GRID = "#e3e7ec"
 DPI = 110
 
@@ -51,42 +50,86 @@ def series_names(results: Sequence[EvaluationResult]) -> list[str]:
     names = []
     for result in results:
         parts = [result.recording] if len(recordings) > 1 else []
-        names.append(", ".join([*parts, result.method, f"{result.keyframes} keyframes"]))
+        parts += [result.method, f"{result.keyframes} keyframes"]
+        names.append(", ".join([*parts, *(["refined poses"] if result.truth == "refined" else [])]))
     return names
 
 
 def cumulative_plot(results: Sequence[EvaluationResult]) -> Figure:
     """Share of queries within x metres up to 0.5, and within x degrees up to 10, as the paper's Figures 6 and 7.
 
-    Shares are of all queries: one that is not localized is within nothing. The paper's own levels are marked.
+    Shares are of all queries: one that is not localized is within nothing. The paper's own levels are marked. Below,
+    the same up to 0.05 m and 2.5 degrees, where methods differ.
     """
-    figure = Figure(figsize=(12.5, 5.2), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    panels = (
-        (left, "translation_m", TRANSLATION_RANGE_M, PAPER_TRANSLATION, "position error (m)", "0.3 m"),
-        (right, "rotation_deg", ROTATION_RANGE_DEG, PAPER_ROTATION, "rotation error (degrees)", "2.5°"),
-    )
-    for axes, field, reach, paper, label, limit in panels:
-        _frame(axes)
-        x = np.linspace(0, reach, 1001)
-        for i, (result, name) in enumerate(zip(results, series_names(results), strict=True)):
-            errors = [getattr(query, field) for query in result.per_query if query.is_localized]
-            shares = cumulative_shares(errors, result.queries, x)
-            style = "-" if i < len(SERIES) else "--"
-            axes.plot(x, shares, style, color=SERIES[i % len(SERIES)], lw=2.0, label=name, drawstyle="steps-post")
-        axes.plot([paper[0]] * 2, [0, paper[1]], color=FAINT, lw=1.0, ls=(0, (4, 3)), zorder=1)
-        axes.plot([0, paper[0]], [paper[1]] * 2, color=FAINT, lw=1.0, ls=(0, (4, 3)), zorder=1)
-        axes.plot(*paper, "D", color="white", mec=FAINT, mew=1.5, ms=7, zorder=5)
-        axes.annotate(
-            f"the paper: {paper[1]:.0%} within {limit}", paper, (9, -15), textcoords="offset points",
-            color=FAINT, fontsize=10,
-        )  # fmt: skip
-        axes.set_xlim(0, reach)
-        axes.set_ylim(0, 1.02)
-        axes.yaxis.set_major_formatter(PercentFormatter(1.0))
-        axes.set_xlabel(label)
-        axes.set_ylabel("share of all queries")
+    figure = Figure(figsize=(12.5, 9.4), layout="constrained")
+    panels = figure.subplots(2, 2)
+    for row, whole in enumerate((True, False)):
+        for axes, field, reach, near, label in (
+            (panels[row][0], "translation_m", TRANSLATION_RANGE_M, 0.05, "position error (m)"),
+            (panels[row][1], "rotation_deg", ROTATION_RANGE_DEG, 2.5, "rotation error (degrees)"),
+        ):
+            _curves(axes, results, field, reach if whole else near)
+            axes.set_xlabel(label)
+    for axes, paper, limit in ((panels[0][0], PAPER_TRANSLATION, "0.3 m"), (panels[0][1], PAPER_ROTATION, "2.5°")):
+        _mark_paper(axes, paper, limit)
         axes.legend(loc="lower right", labelcolor=INK, framealpha=1.0, edgecolor="white")
+    return figure
+
+
+def _curves(axes: Axes, results: Sequence[EvaluationResult], field: str, reach: float) -> None:
+    style_axes(axes)
+    x = np.linspace(0, reach, 1001)
+    for i, (result, name) in enumerate(zip(results, series_names(results), strict=True)):
+        errors = [getattr(query, field) for query in result.per_query if query.is_localized]
+        shares = cumulative_shares(errors, result.queries, x)
+        style = "-" if i < len(SERIES) else "--"
+        axes.plot(x, shares, style, color=SERIES[i % len(SERIES)], lw=2.0, label=name, drawstyle="steps-post")
+    axes.set_xlim(0, reach)
+    axes.set_ylim(0, 1.02)
+    axes.yaxis.set_major_formatter(PercentFormatter(1.0))
+    axes.set_ylabel("share of all queries")
+
+
+def _mark_paper(axes: Axes, paper: tuple[float, float], limit: str) -> None:
+    axes.plot([paper[0]] * 2, [0, paper[1]], color=FAINT, lw=1.0, ls=(0, (4, 3)), zorder=1)
+    axes.plot([0, paper[0]], [paper[1]] * 2, color=FAINT, lw=1.0, ls=(0, (4, 3)), zorder=1)
+    axes.plot(*paper, "D", color="white", mec=FAINT, mew=1.5, ms=7, zorder=5)
+    axes.annotate(
+        f"the paper: {paper[1]:.0%} within {limit}", paper, (9, -15), textcoords="offset points",
+        color=FAINT, fontsize=10,
+    )  # fmt: skip
+
+
+def timing_plot(results: Sequence[EvaluationResult]) -> Figure | None:
+    """Where the time of a query goes: the median of every stage side by side, one bar per result; None without times.
+
+    What the stages leave of the median of the whole is "other"; medians do not add up exactly.
+    """
+    stages = [stage for stage in TIMING_STAGES if stage != "total"]
+    known = [result for result in results if result.timing_ms.get("total", {}).get("p50") is not None]
+    if not known:
+        return None
+    figure = Figure(figsize=(12.5, 1.1 + 0.42 * len(known)), layout="constrained")
+    axes = figure.subplots()
+    style_axes(axes)
+    axes.grid(visible=False, axis="y")
+    names = series_names(known)
+    left = np.zeros(len(known))
+    for colour, stage in zip(STAGE_COLOURS, stages, strict=True):
+        widths = np.array([result.timing_ms.get(stage, {}).get("p50") or 0.0 for result in known])
+        if widths.any():
+            axes.barh(names, widths, left=left, color=colour, height=0.66, label=stage, zorder=3)
+            left += widths
+    total = np.array([result.timing_ms["total"]["p50"] or 0.0 for result in known])
+    rest = np.maximum(total - left, 0.0)
+    axes.barh(names, rest, left=left, color=GRID, height=0.66, label="other", zorder=3)
+    for y, (drawn, value) in enumerate(zip(left + rest, total, strict=True)):
+        axes.text(drawn, y, f"  {value:.0f} ms", va="center", color=INK, fontsize=10)
+    axes.invert_yaxis()
+    axes.set_xlim(0, 1.12 * float((left + rest).max()))
+    axes.set_xlabel("milliseconds per query, median")
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.0 + 0.9 / (1.1 + 0.42 * len(known))), ncols=9, frameon=False,
+                labelcolor=INK, fontsize=9)  # fmt: skip
     return figure
 
 
@@ -100,7 +143,7 @@ def trajectory_plot(result: EvaluationResult) -> Figure | None:
     ground -= ground.mean(axis=0)
     figure = Figure(figsize=(9.0, 6.4), layout="constrained")
     axes = figure.subplots()
-    _frame(axes)
+    style_axes(axes)
     axes.plot(ground[:, 0], ground[:, 1], color="#c9d0d8", lw=1.0, zorder=1)
     localized = np.array([query.is_localized and query.translation_m is not None for query in posed])
     if localized.any():
@@ -133,7 +176,7 @@ def inlier_plot(result: EvaluationResult) -> Figure:
     """Inliers against position error, one mark per query, coloured by verdict; queries without a pose on top."""
     figure = Figure(figsize=(9.0, 5.6), layout="constrained")
     axes = figure.subplots()
-    _frame(axes)
+    style_axes(axes)
     shapes = {Verdict.LOCALIZED: "o", Verdict.AMBIGUOUS: "^", Verdict.FAILED: "X"}
     known = [error for error in (query.translation_m for query in result.per_query) if error]
     ceiling = 2.5 * max([*known, 2 * FALSE_TRANSLATION_M])
@@ -177,6 +220,7 @@ def _heading(result: EvaluationResult) -> str:
     return (
         f"{result.recording}: {result.method}, {result.keyframes} keyframes, "
         f"{result.localized} of {result.queries} queries localized"
+        + (", refined poses" if result.truth == "refined" else "")
     )
 
 
@@ -200,7 +244,8 @@ def _mark(
     )  # fmt: skip
 
 
-def _frame(axes: Axes) -> None:
+def style_axes(axes: Axes) -> None:
+    """Grid and colours that all plots share."""
     axes.grid(visible=True, color=GRID, lw=0.8)
     axes.set_axisbelow(True)
     for side in ("top", "right"):

@@ -9,6 +9,8 @@ from semdb.errors import UsageError
 from semdb.types import FloatArray
 
 PAPER = "paper"
+SPLIT = "split"
+PROTOCOLS = (PAPER, SPLIT)
 
 
 class PosedEntry(Protocol):

@@ -2,19 +2,36 @@
 
 from __future__ import annotations
 
-import base64
-import math
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from pathlib import Path
 
-from semdb.errors import UsageError
-from semdb.evaluation.metrics import EvaluationResult, QueryResult, write_json, write_queries_csv
-from semdb.evaluation.plots import cumulative_plot, figure_png, inlier_plot, trajectory_plot
-from semdb.evaluation.tables import HEADERS, PAPER_HEADERS, TEXT_COLUMNS, by_keyframes, paper_rows, result_row
+from matplotlib.figure import Figure
 
-WORST = 10
-NOTHING = "-"
+from semdb.errors import UsageError
+from semdb.evaluation import html
+from semdb.evaluation.averages import averages
+from semdb.evaluation.comparisons import table_1, table_3, table_4
+from semdb.evaluation.confidence_plots import answers, confidence_plot, has_both
+from semdb.evaluation.failures import explain, median_sharpness
+from semdb.evaluation.files import write_averages, write_json, write_queries_csv
+from semdb.evaluation.formats import NOTHING, errors, percent
+from semdb.evaluation.methods import ABLATION, SEMDB
+from semdb.evaluation.metrics import EvaluationResult, QueryResult
+from semdb.evaluation.plots import cumulative_plot, figure_png, inlier_plot, series_names, timing_plot, trajectory_plot
+from semdb.evaluation.published import PAPER_TIMING_MS
+from semdb.evaluation.tables import (
+    HEADERS,
+    ablation_grids,
+    average_grid,
+    by_keyframes,
+    name_of,
+    result_row,
+    retrieval_grid,
+    truth_grids,
+)
+from semdb.evaluation.worst import worst_queries
+
 WORST_HEADERS = (
     "frame",
     "verdict",
@@ -26,36 +43,7 @@ WORST_HEADERS = (
     "stage",
     "why",
 )
-STYLE = """
-body { font: 15px/1.5 system-ui, "Segoe UI", "DejaVu Sans", sans-serif; color: #1b2430; margin: 2rem auto;
-  max-width: 1240px; padding: 0 1.5rem; }
-h1 { font-size: 1.6rem; margin-bottom: .2rem; } h2 { font-size: 1.2rem; margin-top: 2.4rem; }
-h3 { font-size: 1rem; margin: 1.6rem 0 .4rem; }
-p.note { color: #6b7683; max-width: 62rem; }
-div.wide { overflow-x: auto; }
-table { border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabular-nums; }
-th, td { padding: .35rem .7rem; text-align: right; white-space: nowrap; border-bottom: 1px solid #e3e7ec; }
-th { color: #6b7683; font-weight: 600; } th.text, td.text { text-align: left; }
-td.prose { white-space: normal; text-align: left; min-width: 16rem; }
-tr:hover td { background: #f6f8fa; }
-.localized { color: #1e8e4e; } .ambiguous { color: #c77700; } .failed, .false { color: #c0322b; font-weight: 600; }
-img { max-width: 100%; height: auto; display: block; margin: .6rem 0; }
-dl { display: grid; grid-template-columns: max-content auto; gap: .2rem 1.2rem; } dt { color: #6b7683; } dd { margin: 0;
-  overflow-wrap: anywhere; }
-"""
-
-PictureOf = Callable[[EvaluationResult, QueryResult], bytes | None]
-
-
-def worst_queries(result: EvaluationResult, count: int = WORST) -> list[QueryResult]:
-    """The `count` queries to look at first: false localizations by error, then failures, then the largest errors."""
-
-    def order(query: QueryResult) -> tuple[int, float]:
-        rank = 0 if query.is_false else 1 if not query.is_localized else 2
-        error = (query.translation_m or 0.0) / 0.25 + (query.rotation_deg or 0.0) / 5.0
-        return rank, -error if math.isfinite(error) else 0.0
-
-    return sorted(result.per_query, key=order)[:count]
+Section = tuple[str, str, str]  # identifier, heading, HTML
 
 
 def write_report(
@@ -63,13 +51,13 @@ def write_report(
     results: Sequence[EvaluationResult],
     *,
     settings: Mapping[str, str] | None = None,
-    picture_of: PictureOf | None = None,
+    failures: Mapping[str, str] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Write ``results.json``, ``queries.csv``, ``*.png`` and ``index.html`` to `directory`; returns the page.
+    """Write ``results.json``, ``averages.json``, ``queries.csv``, ``*.png`` and ``index.html``; returns the page.
 
-    The page is self-contained: style and images are inside it, and it links to nothing. `settings` are shown as
-    they are (leave passwords out). `picture_of` may give a PNG of a query for the list of worst queries.
+    The page is self-contained: style and images are inside it, and it loads nothing. `settings` are shown as they
+    are (leave passwords out); `failures` are recordings that could not be evaluated, and why.
     Raises UsageError without results, or when `directory` cannot be written.
     """
     if not results:
@@ -78,96 +66,186 @@ def write_report(
     try:
         directory.mkdir(parents=True, exist_ok=True)
         write_json(directory / "results.json", ordered)
+        write_averages(directory / "averages.json", averages(ordered))
         write_queries_csv(directory / "queries.csv", ordered)
-        sections = [_summary(ordered, settings or {}), _curves(directory, ordered)]
+        sections = [
+            ("results", "Results", _summary(ordered)),
+            ("paper", "Beside the paper", _beside_the_paper(ordered)),
+            ("errors", "Figures 6 and 7: share of queries within an error", _curves(directory, ordered)),
+            ("retrieval", "Retrieval", html.grid_html(retrieval_grid(ordered), heading=False)),
+            ("time", "Time per query", _timing(directory, ordered)),
+            *_optional(directory, ordered),
+        ]
+        details = []
         for number, result in enumerate(ordered, start=1):
-            sections.append(_details(directory, result, number, picture_of))
+            details.append(_details(directory, result, number))
             if progress is not None:
                 progress(number, len(ordered))
-        sections.append(_beside_the_paper(ordered))
-        page = directory / "index.html"
-        page.write_text(_page("semdb evaluation", sections), encoding="utf-8")
+        sections.append(("queries", "Queries to look at first", _details_note() + "\n".join(details)))
+        sections.append(("settings", "Models and settings", _settings(ordered, settings or {})))
+        path = directory / "index.html"
+        path.write_text(html.page("semdb evaluation", _lead(ordered, failures or {}), sections), encoding="utf-8")
     except OSError as error:
         raise UsageError(f"the report cannot be written to {directory}: {error}") from error
-    return page
+    return path
 
 
-def _page(title: str, sections: Sequence[str]) -> str:
-    return (
-        f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{escape(title)}</title>\n'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<style>{STYLE}</style>\n'
-        f"</head>\n<body>\n<h1>{escape(title)}</h1>\n" + "\n".join(sections) + "\n</body>\n</html>\n"
-    )
+def _lead(results: Sequence[EvaluationResult], failures: Mapping[str, str]) -> str:
+    """The first screen: what was run, what came out, and what could not be run."""
+    recordings = list(dict.fromkeys(result.recording for result in results))
+    methods = list(dict.fromkeys(name_of(result) for result in results))
+    protocols = ", ".join(dict.fromkeys(result.protocol for result in results))
+    lead = html.note(f"Protocol {protocols}: {', '.join(recordings)}. Methods: {', '.join(methods)}.")
+    for name, why in failures.items():
+        lead += f'<div class="problem"><b>{escape(name)}</b> was not evaluated: {escape(why)}</div>'
+    shown = [result for result in results if result.method == SEMDB and result.truth == "given"] or list(results)
+    entries = []
+    for result in shown[:4]:
+        where = f"{result.recording}, {result.method}, {result.keyframes} keyframes, {result.queries} queries"
+        figures = f"{percent(result.success_rate)} localized, {result.false_localizations} false"
+        entries.append((errors(result.median_translation_m, result.median_rotation_deg), f"median m / °, {where}"))
+        entries.append((percent(result.recall["5cm_5deg"]), f"within 5 cm and 5°, {where}; {figures}"))
+    return lead + html.cards(entries)
 
 
-def _summary(results: Sequence[EvaluationResult], settings: Mapping[str, str]) -> str:
-    protocols = ", ".join(sorted({result.protocol for result in results}))
+def _summary(results: Sequence[EvaluationResult]) -> str:
     parts = [
-        f'<p class="note">Protocol {escape(protocols)}. Medians and means are over localized queries; every other '
-        "share is of all queries. False: reported as localized, but off by more than 0.25 m or 5°. Ranked: median "
-        "share of the map's keyframes compared by place vector; matched: median number of keyframes matched.</p>",
-        _table(HEADERS, [result_row(result) for result in results]),
+        html.note(
+            "Medians and means are over localized queries; every other share is of all queries. False: reported as "
+            "localized, but off by more than 0.25 m or 5°. Ranked: median share of the map's keyframes compared by "
+            "place vector; matched: median number of keyframes matched."
+        ),
     ]
-    entries: dict[str, str] = {}
-    for model in dict.fromkeys(model for result in results for model in result.models):
-        name = f"{model.name} {model.sha256[:12]}".strip()
-        entries[model.role] = f"{entries[model.role]}, {name}" if model.role in entries else name
-    entries |= settings
-    if entries:
-        terms = "".join(f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in entries.items())
-        parts.append(f"<h2>Models and settings</h2>\n<dl>{terms}</dl>")
+    for recording in dict.fromkeys(result.recording for result in results):
+        chosen = [result for result in results if result.recording == recording]
+        parts.append(f"<h3>{escape(recording)}</h3>")
+        parts.append(html.table(HEADERS[1:], [result_row(result)[1:] for result in chosen], text_columns=1))
+    means = average_grid(averages(results))
+    if means.rows:
+        parts.append(html.grid_html(means))
+    stages = [(result, _stages(result)) for result in results]
+    rows = [(result.recording, name_of(result), str(result.keyframes), text) for result, text in stages if text]
+    parts.append(
+        html.folded(
+            "Queries by the stage that answered", "", html.table(("recording", "method", "keyframes", "stages"), rows)
+        )
+    )
     return "\n".join(parts)
+
+
+def _stages(result: EvaluationResult) -> str:
+    return ", ".join(f"{stage} {count}" for stage, count in sorted(result.stages.items()))
+
+
+def _beside_the_paper(results: Sequence[EvaluationResult]) -> str:
+    return "\n".join(html.grid_html(grid) for grid in (table_3(results), table_4(results))) + html.folded(
+        table_1(results).title, "", html.grid_html(table_1(results), heading=False)
+    )
 
 
 def _curves(directory: Path, results: Sequence[EvaluationResult]) -> str:
     """The cumulative plots, one picture per recording, so that each stays legible."""
-    parts = ["<h2>Share of queries within an error</h2>"]
+    parts = [
+        html.note(
+            "Shares are of all queries, so a curve ends at the share that is localized and in range. The diamonds are "
+            "what the paper reports of its own queries: above 90 % within 0.3 m, over 80 % within 2.5°."
+        )
+    ]
     for number, recording in enumerate(dict.fromkeys(result.recording for result in results), start=1):
         chosen = [result for result in results if result.recording == recording]
-        data = figure_png(cumulative_plot(chosen))
-        (directory / f"errors-{number}.png").write_bytes(data)
-        parts.append(f"<h3>{escape(recording)}</h3>\n" + _image(data, f"cumulative errors on {recording}"))
+        parts.append(f"<h3>{escape(recording)}</h3>")
+        parts.append(_figure(directory / f"errors-{number}.png", cumulative_plot(chosen), f"errors on {recording}"))
     return "\n".join(parts)
 
 
-def _details(directory: Path, result: EvaluationResult, number: int, picture_of: PictureOf | None) -> str:
-    heading = f"{result.recording}: {result.method}, {result.keyframes} keyframes"
-    parts = [f"<h2>{escape(heading)}</h2>"]
-    for name, figure in (("trajectory", trajectory_plot(result)), ("inliers", inlier_plot(result))):
-        if figure is None:
-            continue
-        data = figure_png(figure)
-        (directory / f"{name}-{number}.png").write_bytes(data)
-        parts.append(_image(data, f"{name}, {heading}"))
-    if result.stages:
-        stages = ", ".join(f"{escape(stage)} {count}" for stage, count in sorted(result.stages.items()))
-        parts.append(f"<p>Queries answered by stage: {stages}.</p>")
-    timing = [
-        (stage, *(NOTHING if value is None else f"{value:.1f}" for value in (values["p50"], values["p95"])))
-        for stage, values in result.timing_ms.items()
-        if values["p50"] is not None
+def _timing(directory: Path, results: Sequence[EvaluationResult]) -> str:
+    paper = " and ".join(f"{value:g} ms for the {name}" for name, value in PAPER_TIMING_MS.items())
+    parts = [html.note(f"Medians on the machine of this run. The paper reports {paper}, on a TITAN Xp.")]
+    figure = timing_plot(results)
+    if figure is not None:
+        parts.append(_figure(directory / "timing.png", figure, "time per query by stage"))
+    stages = list(dict.fromkeys(stage for result in results for stage in result.timing_ms))
+    used = [stage for stage in stages if any(result.timing_ms.get(stage, {}).get("p50") for result in results)]
+    rows = [
+        (result.recording, name_of(result), str(result.keyframes), *(_percentiles(result, stage) for stage in used))
+        for result in results
     ]
-    parts.append("<h3>Time per query</h3>\n" + _table(("stage", "p50 ms", "p95 ms"), timing, text_columns=1))
-    worst = worst_queries(result)
-    parts.append(f"<h3>The {len(worst)} queries to look at first</h3>\n" + _worst_table(worst))
-    if picture_of is not None:
-        for query in worst:
-            picture = picture_of(result, query)
-            if picture is not None:
-                parts.append(_image(picture, query.frame))
+    parts.append(
+        html.folded("All stages", "p50 / p95 in ms", html.table(("recording", "method", "keyframes", *used), rows))
+    )
     return "\n".join(parts)
 
 
-def _beside_the_paper(results: Sequence[EvaluationResult]) -> str:
-    note = (
-        "Keyframes and queries of one sequence, as in the paper's Table 3. Other sequences are another task: the "
-        "table shows the region, not a ranking."
+def _percentiles(result: EvaluationResult, stage: str) -> str:
+    values = result.timing_ms.get(stage, {})
+    known = [values.get(name) for name in ("p50", "p95")]
+    return " / ".join(NOTHING if value is None else f"{value:.1f}" for value in known)
+
+
+def _optional(directory: Path, results: Sequence[EvaluationResult]) -> list[Section]:
+    """Sections for what not every run has: ablation, two truths, right and wrong answers with a confidence."""
+    sections: list[Section] = []
+    methods = {result.method for result in results}
+    if {name for _, _, name in ABLATION} <= methods:
+        layers = "\n".join(html.grid_html(grid) for grid in ablation_grids(results))
+        sections.append(("ablation", "What each layer brings", layers))
+    grids = [grid for grid in truth_grids(results) if grid.rows]
+    if grids:
+        explained = html.note(
+            "Refined poses come from bundle adjustment of all images and are brought back to the given world frame by "
+            "one similarity. Where the two truths differ as much as the errors, the given poses are the limit."
+        )
+        sections.append(
+            ("truth", "Can the true poses be trusted?", explained + "\n".join(html.grid_html(grid) for grid in grids))
+        )
+    chosen = [result for result in results if has_both(result)]
+    if chosen:
+        sections.append(("confidence", "Can the confidence be trusted?", _confidence(directory, chosen)))
+    return sections
+
+
+def _confidence(directory: Path, results: Sequence[EvaluationResult]) -> str:
+    series = [(name, *answers(result)) for name, result in zip(series_names(results), results, strict=True)]
+    text = (
+        "Right: a pose within 0.25 m and 5°, whatever the verdict; wrong poses and failures are the negatives. Only "
+        "results with both are drawn, and few negatives make rough curves: "
+        + "; ".join(f"{name}: {int((~right).sum())} wrong of {len(right)}" for name, _, right in series)
+        + "."
     )
-    table = _table(PAPER_HEADERS, paper_rows(results))
-    return f'<h2>Beside Table 3 of the paper</h2>\n<p class="note">{note}</p>\n{table}'
+    return html.note(text) + _figure(directory / "confidence.png", confidence_plot(series), "confidence")
 
 
-def _worst_table(queries: Sequence[QueryResult]) -> str:
+def _details_note() -> str:
+    return html.note(
+        "Of every result the ten queries to look at first: false localizations, then failures, then the largest "
+        "errors, with what was matched in the best keyframe. A click opens a result."
+    )
+
+
+def _details(directory: Path, result: EvaluationResult, number: int) -> str:
+    heading = f"{result.recording}: {name_of(result)}, {result.keyframes} keyframes"
+    parts = []
+    for name, figure in (("trajectory", trajectory_plot(result)), ("inliers", inlier_plot(result))):
+        if figure is not None:
+            parts.append(_figure(directory / f"{name}-{number}.png", figure, f"{name}, {heading}"))
+    worst = worst_queries(result)
+    usual = median_sharpness(result.per_query)
+    pictures = [
+        f"<figure>{html.image(picture, query.frame, 'jpeg')}<figcaption>{_caption(query, usual)}</figcaption></figure>"
+        for query in worst
+        for picture in (result.pictures.get((query.recording, query.frame_index)),)
+        if picture is not None
+    ]
+    parts = [f"<h3>The {len(worst)} queries to look at first</h3>", _worst_table(worst, usual), *pictures, *parts]
+    small = f"{result.localized} of {result.queries} localized, {result.false_localizations} false"
+    return html.folded(heading, small, "\n".join(parts), is_open=result.method == SEMDB)
+
+
+def _caption(query: QueryResult, usual: float | None) -> str:
+    return f"<b>{escape(query.frame)}</b>: {escape(explain(query, usual))}. {escape(query.reason)}"
+
+
+def _worst_table(queries: Sequence[QueryResult], usual: float | None) -> str:
     rows = []
     for query in queries:
         word = "false" if query.is_false else str(query.verdict)
@@ -176,7 +254,7 @@ def _worst_table(queries: Sequence[QueryResult]) -> str:
             f'<td class="text {word}">{query.verdict}{" (false)" if query.is_false else ""}</td>',
             *(f"<td>{escape(cell)}</td>" for cell in _numbers(query)),
             f'<td class="text">{escape(query.stage)}</td>',
-            f'<td class="prose">{escape(query.reason)}</td>',
+            f'<td class="prose">{escape(explain(query, usual))}. {escape(query.reason)}</td>',
         ]
         rows.append("<tr>" + "".join(cells) + "</tr>")
     heads = "".join(
@@ -196,17 +274,16 @@ def _numbers(query: QueryResult) -> tuple[str, ...]:
     )
 
 
-def _table(headers: Sequence[str], rows: Sequence[Sequence[str]], text_columns: int = TEXT_COLUMNS) -> str:
-    def line(cells: Sequence[str], tag: str) -> str:
-        marked = (
-            f'<{tag} class="text">{escape(cell)}</{tag}>' if i < text_columns else f"<{tag}>{escape(cell)}</{tag}>"
-            for i, cell in enumerate(cells)
-        )
-        return "<tr>" + "".join(marked) + "</tr>"
-
-    body = "".join(line(row, "td") for row in rows)
-    return f'<div class="wide"><table>{line(headers, "th")}{body}</table></div>'
+def _settings(results: Sequence[EvaluationResult], settings: Mapping[str, str]) -> str:
+    entries: dict[str, str] = {}
+    for model in dict.fromkeys(model for result in results for model in result.models):
+        name = f"{model.name} {model.sha256[:12]}".strip()
+        entries[model.role] = f"{entries[model.role]}, {name}" if model.role in entries else name
+    return html.definitions(list((entries | dict(settings)).items()))
 
 
-def _image(png: bytes, alt: str) -> str:
-    return f'<img alt="{escape(alt, quote=True)}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
+def _figure(path: Path, figure: Figure, alt: str) -> str:
+    """The figure as a file beside the page, and inside it."""
+    data = figure_png(figure)
+    path.write_bytes(data)
+    return html.image(data, alt)

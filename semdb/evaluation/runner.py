@@ -1,43 +1,64 @@
-"""Runs an evaluation: keyframes into a database of its own, the other frames as queries, one result per method."""
+"""Runs evaluations: keyframes into a database of its own, the other frames as queries, one result per method."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from semdb.database.store import Store
-from semdb.errors import FrameError
-from semdb.evaluation.baselines import SiftReference, nearest_in_pose
-from semdb.evaluation.methods import ORACLE, SEMDB, SIFT_REFERENCE, Method, method_named
-from semdb.evaluation.metrics import EvaluationResult, QueryResult, query_result, summarise
-from semdb.evaluation.protocols import PAPER, evenly_spaced, split_paper
+from semdb.errors import SemdbError, UsageError
+from semdb.evaluation.colmap import load_pycolmap
+from semdb.evaluation.methods import COLMAP, SEMDB, Method, method_named
+from semdb.evaluation.metrics import EvaluationResult, QueryResult, summarise, with_other_truth
+from semdb.evaluation.protocols import PAPER, PROTOCOLS, evenly_spaced
+from semdb.evaluation.runs import Described, Describers, Run, open_run, read_frames
+from semdb.evaluation.splits import folder_plan, paper_plans, scene_plan
+from semdb.evaluation.tasks import GIVEN, REFINED, Plan, Task, refine_truth
 from semdb.evaluation.workspace import evaluation_store
-from semdb.ingest import IngestOptions, ingest_recording
-from semdb.keyframes import select_keyframes
-from semdb.localization.localizer import Localizer
-from semdb.localize import check_coarse, make_localizer
+from semdb.evaluation.worst import PackedDetection, Shown, draw_worst
+from semdb.localize import check_coarse
 from semdb.model_choice import specs_for_ingest
-from semdb.perception.describe import Describer, describer_from_specs
-from semdb.recordings import open_recordings
-from semdb.recordings.base import FrameEntry, Recording
+from semdb.recordings.base import Recording
 from semdb.settings import Settings
-from semdb.types import Camera, Description, Frame, Localization, ModelInfo
+from semdb.types import Camera
+
+BOTH = "both"
+TRUTHS = (GIVEN, REFINED, BOTH)
 
 Progress = Callable[[str, int, int], None]
+Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
 class EvaluateOptions:
-    """`query_depth` gives the queries their depth images too; otherwise a query is one colour image."""
+    """`query_depth` gives the queries of every method their depth images; otherwise a query is one colour image.
+
+    `keyframes` are numbers to run one by one, None for what the protocol chooses. `map_from` and `query_from` are
+    folders for protocol `split`. `truth` is ``given``, ``refined`` or ``both``. `pictures` is how many of the worst
+    queries are drawn.
+    """
 
     methods: tuple[str, ...] = (SEMDB,)
-    keyframes: int | None = None
+    keyframes: tuple[int | None, ...] = (None,)
     max_queries: int | None = None
     coarse: str = "sql"
     camera: Camera | None = None
     query_depth: bool = False
+    protocol: str = PAPER
+    map_from: tuple[Path, ...] = ()
+    query_from: tuple[Path, ...] = ()
+    truth: str = GIVEN
+    pictures: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of one recording (or scene) and number of keyframes: its results, or why there are none."""
+
+    name: str
+    results: tuple[EvaluationResult, ...] = ()
+    error: SemdbError | None = None
 
 
 def evaluate(
@@ -46,85 +67,179 @@ def evaluate(
     options: EvaluateOptions | None = None,
     *,
     progress: Progress | None = None,
-    say: Callable[[str], None] | None = None,
+    say: Say | None = None,
 ) -> list[EvaluationResult]:
-    """Protocol `paper` on every recording under `paths`, every method on the same keyframes and queries.
-
-    Raises what `semdb.ingest.ingest_recordings` raises, and UsageError for an unknown method or too few frames.
-    """
-    options = options or EvaluateOptions()
-    methods = [method_named(name) for name in options.methods]
-    check_coarse(options.coarse)
-    if options.max_queries is not None:
-        evenly_spaced(0, options.max_queries)  # says now what would be wrong with it later
-    recordings = [found for path in paths for found in open_recordings(path, options.camera)]
-    results = []
-    for recording in recordings:
-        specs = specs_for_ingest(settings, (), has_masks=recording.categories is not None)
-        for note in (*recording.notes, *specs.notes):
-            if say is not None:
-                say(f"{recording.name}: {note}")
-        describers = _Describers(specs.detector, specs.encoder, specs.features, settings)
-        results += _evaluate_recording(recording, describers, methods, settings, options, progress)
-        if say is not None:
-            for line in _unusable(recording):
-                say(line)
+    """All results of `evaluate_each`; the first failure is raised."""
+    results: list[EvaluationResult] = []
+    for outcome in evaluate_each(paths, settings, options, progress=progress, say=say):
+        if outcome.error is not None:
+            raise outcome.error
+        results += outcome.results
     return results
 
 
-class _Describers:
-    """One describer per kind of features, sharing the networks."""
+def evaluate_each(
+    paths: Sequence[Path],
+    settings: Settings,
+    options: EvaluateOptions | None = None,
+    *,
+    progress: Progress | None = None,
+    say: Say | None = None,
+) -> Iterator[Outcome]:
+    """One outcome per recording or scene and number of keyframes, as soon as it is there.
 
-    def __init__(self, detector: str, encoder: str, features: str, settings: Settings) -> None:
-        self._default = features
-        self._settings = settings
-        self._made = {features: describer_from_specs(detector, encoder, features, settings)}
+    What is wrong with one recording is the `error` of its outcome, and the others go on. Raises UsageError for what
+    is wrong with the options, and ModelError where a method needs what is not installed, before anything runs.
+    """
+    options = options or EvaluateOptions()
+    methods = check_options(paths, options)
+    plans = []
+    for name, opening in _openings(paths, options):
+        try:
+            plans += opening()
+        except SemdbError as error:
+            if say is not None:
+                say(f"not evaluated: {error}")
+            yield Outcome(name, error=error)
+    for plan in plans:
+        for keyframes in options.keyframes:
+            try:
+                results = _evaluate_plan(plan, keyframes, methods, settings, options, progress, say)
+            except SemdbError as error:
+                yield Outcome(plan.name, error=error)
+            else:
+                yield Outcome(plan.name, tuple(results))
 
-    def of(self, method: Method) -> Describer:
-        name = method.features or self._default
-        if name not in self._made:
-            from semdb.perception.features import load_features
 
-            first = self._made[self._default]
-            self._made[name] = Describer(first.detector, first.encoder, load_features(name, self._settings))
-        return self._made[name]
+def check_options(paths: Sequence[Path], options: EvaluateOptions) -> list[Method]:
+    """The methods. Raises UsageError or ModelError for what could not work in the end."""
+    methods = [method_named(name) for name in dict.fromkeys(options.methods)]
+    check_coarse(options.coarse)
+    for name, value, known in (("protocol", options.protocol, PROTOCOLS), ("truth", options.truth, TRUTHS)):
+        if value not in known:
+            raise UsageError(f"--{name} {value}: known are {', '.join(known)}")
+    if options.max_queries is not None:
+        evenly_spaced(0, options.max_queries)  # says now what would be wrong with it later
+    if options.truth != GIVEN or any(method.name == COLMAP for method in methods):
+        load_pycolmap()
+    by_name = options.map_from or options.query_from
+    if by_name and paths:
+        raise UsageError("give either folders to evaluate one by one, or --map-from and --query-from, not both")
+    if not by_name and not paths:
+        raise UsageError("name the folder of a recording, or --map-from FOLDER and --query-from FOLDER")
+    return methods
 
 
-def _evaluate_recording(
-    recording: Recording,
-    describers: _Describers,
+def _openings(paths: Sequence[Path], options: EvaluateOptions) -> list[tuple[str, Callable[[], list[Plan]]]]:
+    """What is to be opened, by name; opening may fail for each."""
+    camera = options.camera
+    if options.map_from or options.query_from:
+        name = ", ".join(str(path) for path in (*options.map_from, *options.query_from))
+        return [(name, lambda: [folder_plan(options.map_from, options.query_from, camera)])]
+    if options.protocol == PAPER:
+        return [(str(path), lambda path=path: paper_plans(path, camera)) for path in paths]  # type: ignore[misc]
+    return [(str(path), lambda path=path: [scene_plan(path, camera)]) for path in paths]  # type: ignore[misc]
+
+
+def _evaluate_plan(
+    plan: Plan,
+    keyframes: int | None,
     methods: Sequence[Method],
     settings: Settings,
     options: EvaluateOptions,
     progress: Progress | None,
+    say: Say | None,
 ) -> list[EvaluationResult]:
-    def selecting(done: int, total: int) -> None:
-        if progress is not None:
-            progress(f"selecting keyframes of {recording.name}", done, total)
+    has_masks = all(recording.categories is not None for recording in plan.recordings)
+    specs = specs_for_ingest(settings, (), has_masks=has_masks)
+    notes = [f"{recording.name}: {note}" for recording in plan.recordings for note in recording.notes]
+    for line in dict.fromkeys((*notes, *(f"{plan.name}: {note}" for note in specs.notes))):
+        if say is not None:
+            say(line)
+    describers = Describers(specs.detector, specs.encoder, specs.features, settings)
+    results = []
+    with evaluation_store(settings.database_url, say=say) as store:  # first: it may not answer, and choosing takes long
+        task = plan.choose(keyframes, options.max_queries, progress, say)
+        tasks = [task]
+        if options.truth != GIVEN:
+            tasks = refine_truth(task, both=options.truth == BOTH, progress=progress)
+        runs = [_open(method, tasks[0], describers, store, options, progress) for method in methods]
+        results += _answer(tasks[0], runs, options, progress)
+    for other in tasks[1:]:
+        with evaluation_store(settings.database_url) as store:
+            runs = [_open(method, other, describers, store, options, progress) for method in methods]
+            results += _answer(other, runs, options, progress)
+    for recording in plan.recordings:
+        for line in _unusable(recording):
+            if say is not None:
+                say(line)
+    return results
 
-    with evaluation_store(settings.database_url) as store:  # first: it may not answer, and selecting takes long
-        keyframes = select_keyframes(recording, count=options.keyframes, progress=selecting)
-        queries = split_paper(recording.entries, keyframes, options.max_queries)
-        runs = [_open_run(method, recording, keyframes, describers, store, options, progress) for method in methods]
-        answers: list[list[QueryResult]] = [[] for _ in runs]
-        for done, frame in enumerate(_read(recording, queries), start=1):
-            described: dict[int, tuple[Description, float]] = {}
-            for run, found in zip(runs, answers, strict=True):
-                found.append(run.answer(frame[0], frame[1], described))
-            if progress is not None:
-                progress(f"localizing in {recording.name}", done, len(queries))
-    return [
-        summarise(
-            found,
-            recording=recording.name,
-            protocol=PAPER,
-            method=run.name,
-            models=run.models,
-            frames=recording.total_frames,
-            keyframes=run.keyframes,
-        )
-        for run, found in zip(runs, answers, strict=True)
-    ]
+
+def _open(
+    method: Method,
+    task: Task,
+    describers: Describers,
+    store: Store,
+    options: EvaluateOptions,
+    progress: Progress | None,
+) -> Run:
+    return open_run(method, task, describers, store, options.coarse, options.query_depth, progress)
+
+
+def _answer(
+    task: Task, runs: Sequence[Run], options: EvaluateOptions, progress: Progress | None
+) -> list[EvaluationResult]:
+    """All queries of `task` to all `runs`."""
+    answers: list[list[QueryResult]] = [[] for _ in runs]
+    shown: list[dict[tuple[str, int], Shown]] = [{} for _ in runs]
+    objects: dict[tuple[str, int], list[PackedDetection]] = {}
+    label = f"localizing in {task.name}" + (" with refined poses" if task.truth == REFINED else "")
+    for done, (name, frame, decode_ms) in enumerate(read_frames(task.queries), start=1):
+        described: Described = {}
+        key = name, frame.index
+        for run, found, kept in zip(runs, answers, shown, strict=True):
+            query, localization = run.answer(name, frame, decode_ms, described)
+            found.append(with_other_truth(query, task.other_truth.get(key)))
+            if options.pictures:
+                kept[key] = Shown.of(localization)
+        if options.pictures and described:
+            description = next(iter(described.values()))[0]
+            objects[key] = [PackedDetection.of(thing) for thing in description.detections]
+        if progress is not None:
+            progress(label, done, task.query_count)
+    results = [_result(task, run, found, options) for run, found in zip(runs, answers, strict=True)]
+    if not options.pictures:
+        return results
+    drawn = []
+    for done, (result, run, kept) in enumerate(zip(results, runs, shown, strict=True), start=1):
+        pictures = draw_worst(result, task, run, kept, objects, options.pictures)
+        drawn.append(replace(result, pictures=pictures))
+        if progress is not None:
+            progress(f"drawing queries of {task.name}", done * options.pictures, len(runs) * options.pictures)
+    return drawn
+
+
+def _result(task: Task, run: Run, found: Sequence[QueryResult], options: EvaluateOptions) -> EvaluationResult:
+    result = summarise(
+        found,
+        recording=task.name,
+        protocol=task.protocol,
+        method=run.method.name,
+        models=run.models,
+        frames=task.frames,
+        keyframes=len(run.poses),
+    )
+    return replace(
+        result,
+        sequence=task.sequence,
+        keyframes_asked=task.keyframes_asked,
+        query_depth=options.query_depth or run.method.query_depth,
+        map_recordings=tuple(part.recording.name for part in task.keyframes),
+        query_recordings=tuple(part.recording.name for part in task.queries),
+        truth=task.truth,
+        disagreement=task.disagreement,
+    )
 
 
 def _unusable(recording: Recording) -> list[str]:
@@ -136,119 +251,3 @@ def _unusable(recording: Recording) -> list[str]:
         f"{recording.name}: {len(unusable)} of {recording.total_frames} frames could not be used, the first "
         f"{unusable[0].name}: {unusable[0].reason} (semdb recording {recording.path} names all)"
     ]
-
-
-def _read(recording: Recording, queries: Sequence[FrameEntry]) -> Iterator[tuple[Frame, float]]:
-    """Frames with their decoding time; those that cannot be decoded are in `recording.decode_failures`."""
-    for entry in queries:
-        started = time.perf_counter()
-        try:
-            frame = recording.read(entry)
-        except FrameError as error:
-            recording.note_decode_failure(entry, error)
-            continue
-        yield frame, (time.perf_counter() - started) * 1000
-
-
-class _Run:
-    """A method, ready to answer. `keyframes` is how many it has: those that could be read."""
-
-    def __init__(self, name: str, models: tuple[ModelInfo, ...], keyframes: int) -> None:
-        self.name = name
-        self.models = models
-        self.keyframes = keyframes
-
-    def answer(self, frame: Frame, decode_ms: float, described: dict[int, tuple[Description, float]]) -> QueryResult:
-        """The result for one frame. `described` shares descriptions between the methods of one query."""
-        localization, timing = self.localize(frame, described)
-        timing = {"decode": decode_ms, **timing, **localization.timing_ms}
-        timing["total"] = decode_ms + timing.pop("describe") + timing.pop("localize")
-        return query_result(frame.name, frame.index, localization, frame.world_from_camera, timing_ms=timing)
-
-    def localize(
-        self, frame: Frame, described: dict[int, tuple[Description, float]]
-    ) -> tuple[Localization, dict[str, float]]:
-        """The answer, and wall times; `describe` and `localize` among them, which are whole."""
-        raise TypeError(f"{type(self).__name__} answers nothing")
-
-
-class _LocalizerRun(_Run):
-    def __init__(self, method: Method, describer: Describer, localizer: Localizer, query_depth: bool) -> None:
-        super().__init__(method.name, describer.models, len(localizer.cache.poses()[0]))
-        self._describer = describer
-        self._localizer = localizer
-        self._query_depth = query_depth
-
-    def describe(
-        self, frame: Frame, described: dict[int, tuple[Description, float]]
-    ) -> tuple[Description, dict[str, float]]:
-        key = id(self._describer)
-        if key not in described:
-            started = time.perf_counter()
-            depth = frame.depth if self._query_depth else None
-            description = self._describer.describe(frame.image, depth, frame.camera, frame.instances)
-            described[key] = description, (time.perf_counter() - started) * 1000
-        description, milliseconds = described[key]
-        return description, {"describe": milliseconds, **description.timing_ms}
-
-    def localize(
-        self, frame: Frame, described: dict[int, tuple[Description, float]]
-    ) -> tuple[Localization, dict[str, float]]:
-        description, timing = self.describe(frame, described)
-        started = time.perf_counter()
-        found = self._localizer.localize(description)
-        return found, {**timing, "localize": (time.perf_counter() - started) * 1000}
-
-
-class _OracleRun(_LocalizerRun):
-    """Told the true pose, to choose keyframes by."""
-
-    def localize(
-        self, frame: Frame, described: dict[int, tuple[Description, float]]
-    ) -> tuple[Localization, dict[str, float]]:
-        if frame.world_from_camera is None:
-            raise FrameError(f"{frame.name}: oracle chooses keyframes by the true pose, and there is none")
-        description, timing = self.describe(frame, described)
-        ids, poses = self._localizer.cache.poses()
-        chosen = [ids[position] for position in nearest_in_pose(frame.world_from_camera, poses)]
-        started = time.perf_counter()
-        found = self._localizer.localize_among(description, chosen)
-        return found, {**timing, "localize": (time.perf_counter() - started) * 1000}
-
-
-class _SiftRun(_Run):
-    def __init__(self, reference: SiftReference) -> None:
-        super().__init__(SIFT_REFERENCE, reference.models, len(reference))
-        self._reference = reference
-
-    def localize(
-        self, frame: Frame, described: dict[int, tuple[Description, float]]
-    ) -> tuple[Localization, dict[str, float]]:
-        found = self._reference.localize(frame)
-        features = found.timing_ms["features"]
-        return found, {"describe": features, "localize": found.timing_ms["total"] - features}
-
-
-def _open_run(
-    method: Method,
-    recording: Recording,
-    keyframes: Sequence[FrameEntry],
-    describers: _Describers,
-    store: Store,
-    options: EvaluateOptions,
-    progress: Progress | None,
-) -> _Run:
-    if method.name == SIFT_REFERENCE:
-        frames = (frame for frame, _ in _read(recording, keyframes))
-        return _SiftRun(SiftReference(frames, recording=recording.name))
-    describer = describers.of(method)
-    map_name = describer.features.info.name  # one map per kind of features: rows of two kinds do not mix
-    if all(info.name != map_name for info in store.maps()):
-        ingest = IngestOptions(map_name=map_name, keyframes=options.keyframes)
-        summary = ingest_recording(recording, store, describer, ingest, progress=progress, entries=keyframes)
-        for entry in keyframes:
-            if entry.index in summary.failed:
-                recording.note_decode_failure(entry, FrameError(summary.failed[entry.index]))
-    localizer = make_localizer(store, store.find_map(map_name), options.coarse, method.options)
-    run = _OracleRun if method.name == ORACLE else _LocalizerRun
-    return run(method, describer, localizer, options.query_depth)

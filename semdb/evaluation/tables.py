@@ -1,17 +1,19 @@
-"""Results as tables: on the terminal (rich), as Markdown, and beside the paper's Table 3."""
+"""Results as tables: plain cells first, then on the terminal (rich) and as Markdown; `report` makes HTML of them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Group, RenderableType
 from rich.table import Table
 
+from semdb.evaluation.averages import Average, averages
+from semdb.evaluation.comparisons import Grid, paper_rows_evaluated
+from semdb.evaluation.formats import NOTHING, errors, percent, whole
+from semdb.evaluation.methods import ABLATION, METHODS, WITH_DEPTH
 from semdb.evaluation.metrics import EvaluationResult
 
-NOTHING = "-"
 HEADERS = (
     "recording",
     "method",
@@ -29,50 +31,9 @@ HEADERS = (
     "matched",
     "ms p50 / p95",
 )
-PAPER_METHOD = "the paper"
-CHEN_METHOD = "Chen et al."
 SHORT_HEADERS = ("method", "keyframes", "localized", "false", "median m / °", "5 cm 5°", "ranked")
 MAX_COLUMNS = 3  # results that stand side by side on a terminal
 TEXT_COLUMNS = 2  # the first two are words and stand left, the others are numbers and stand right
-
-
-@dataclass(frozen=True, slots=True)
-class PaperRow:
-    """A row of the paper's Table 3: errors in metres and degrees, success 0..1; None where the paper gives none."""
-
-    sequence: str
-    raw_frames: int | None
-    keyframes: int | None
-    test_frames: int | None
-    median_translation_m: float
-    median_rotation_deg: float
-    mean_translation_m: float
-    mean_rotation_deg: float
-    success_rate: float | None
-    method: str = PAPER_METHOD
-
-
-PAPER_TABLE_3 = (
-    PaperRow("ICL-NUIM living room kt0", 1510, 70, 1000, 0.0096, 0.3265, 0.0607, 2.2212, 0.9170),
-    PaperRow("ICL-NUIM living room kt1", 967, 36, 600, 0.0103, 0.2780, 0.0396, 0.9997, 0.9600),
-    PaperRow("ICL-NUIM living room kt2", 882, 54, 500, 0.0097, 0.2612, 0.0395, 0.9361, 0.9987),
-    PaperRow("ICL-NUIM living room kt3", 1242, 101, 800, 0.0088, 0.3142, 0.0317, 1.3179, 0.9575),
-    PaperRow("ICL-NUIM office room kt0", 1510, 77, 1000, 0.0199, 0.4123, 0.1549, 3.1138, 0.8977),
-    PaperRow("ICL-NUIM office room kt1", 967, 47, 600, 0.0091, 0.3193, 0.0462, 2.0639, 0.7794),
-    PaperRow("ICL-NUIM office room kt2", 882, 54, 500, 0.0113, 0.2948, 0.0768, 1.5928, 0.9400),
-    PaperRow("ICL-NUIM office room kt3", 1242, 45, 800, 0.0152, 0.4550, 0.0525, 1.5997, 0.8696),
-    PaperRow("ICL-NUIM, all", None, None, None, 0.0118, 0.3327, 0.0628, 1.7307, 0.9150),
-    PaperRow("TUM freiburg1_plant", 1120, 171, 800, 0.0179, 0.6079, 0.0678, 2.3161, 0.9329),
-    PaperRow("TUM freiburg1_room", 1352, 243, 1000, 0.0141, 0.6978, 0.0768, 3.4290, 0.9243),
-    PaperRow("TUM freiburg2_360_hemisphere", 2647, 800, 2000, 0.0797, 0.8259, 0.4790, 5.4154, 0.8965),
-    PaperRow("TUM freiburg2_flowerbouquet", 2859, 323, 2000, 0.0138, 0.6443, 0.0295, 1.6028, 0.9612),
-    PaperRow("TUM freiburg2_pioneer_slam3", 2224, 253, 1800, 0.0344, 0.6426, 0.2653, 3.7028, 0.8576),
-    PaperRow("TUM freiburg3_long_office_household", 2486, 246, 2000, 0.0148, 0.5660, 0.0302, 1.0600, 0.9967),
-    PaperRow("TUM RGB-D, all", None, None, None, 0.0291, 0.6641, 0.1581, 2.9210, 0.9282),
-    PaperRow("ICL-NUIM, all", None, None, None, 0.06, 0.01, 0.34, 3.43, None, CHEN_METHOD),
-    PaperRow("TUM RGB-D, all", None, None, None, 0.10, 0.16, 0.32, 5.58, None, CHEN_METHOD),
-)
-PAPER_HEADERS = ("sequence", "method", "frames", "keyframes", "queries", "median m / °", "mean m / °", "success")
 
 
 def result_row(result: EvaluationResult) -> tuple[str, ...]:
@@ -80,7 +41,7 @@ def result_row(result: EvaluationResult) -> tuple[str, ...]:
     total = result.timing_ms.get("total", {})
     return (
         result.recording,
-        result.method,
+        name_of(result),
         str(result.frames),
         str(result.keyframes),
         str(result.queries),
@@ -111,7 +72,7 @@ def results_table(results: Sequence[EvaluationResult], title: str | None = None)
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, header_style="bold")
     table.add_column("")
     for result in results:
-        table.add_column(f"{result.recording}\n{result.method}", justify="right", overflow="fold")
+        table.add_column(f"{result.recording}\n{name_of(result)}", justify="right", overflow="fold")
     rows = [(*result_row(result)[TEXT_COLUMNS:], _stages(result)) for result in results]
     for name, *cells in zip((*HEADERS[TEXT_COLUMNS:], "answered by stage"), *rows, strict=True):
         table.add_row(name, *cells)
@@ -120,7 +81,7 @@ def results_table(results: Sequence[EvaluationResult], title: str | None = None)
 
 def _short_row(result: EvaluationResult) -> tuple[str, ...]:
     return (
-        result.method,
+        name_of(result),
         str(result.keyframes),
         f"{result.localized} / {result.queries}",
         str(result.false_localizations),
@@ -140,64 +101,164 @@ def results_markdown(results: Sequence[EvaluationResult]) -> str:
 
 
 def by_keyframes(results: Sequence[EvaluationResult]) -> list[EvaluationResult]:
-    """The results by recording, method and number of keyframes: the order of a table over that number."""
-    return sorted(results, key=lambda result: (result.recording, result.method, result.keyframes))
+    """By recording, method (in the order of `METHODS`) and number of keyframes, given poses before refined ones."""
+    order = {name: place for place, name in enumerate(METHODS)}
+
+    def key(result: EvaluationResult) -> tuple[str, str, int, str, int]:
+        plain = result.method.removesuffix(WITH_DEPTH)
+        return result.recording, result.truth, order.get(plain, len(order)), result.method, result.keyframes
+
+    return sorted(results, key=key)
 
 
-def paper_rows(results: Sequence[EvaluationResult] = ()) -> list[tuple[str, ...]]:
-    """The paper's Table 3 under `PAPER_HEADERS`, and below it the same columns of `results`."""
+def name_of(result: EvaluationResult) -> str:
+    """The method, and what tells it from the same method on the same recording."""
+    return result.method + (" (refined poses)" if result.truth == "refined" else "")
+
+
+def terminal_tables(results: Sequence[EvaluationResult], *, ablation: bool = False) -> list[RenderableType]:
+    """All that `semdb evaluate` prints: the results, and what there is to compare them with."""
+    grids = [
+        *(ablation_grids(results) if ablation else ()),
+        average_grid(averages(results)),
+        paper_rows_evaluated(results),
+        retrieval_grid(results),
+        *truth_grids(results),
+    ]
+    return [results_table(results), *(rich_table(grid) for grid in grids if grid.rows)]
+
+
+def average_grid(found: Sequence[Average]) -> Grid:
+    """Means over recordings, as in the paper's Table 3."""
     rows = [
         (
-            row.sequence,
-            row.method,
-            *(NOTHING if count is None else str(count) for count in (row.raw_frames, row.keyframes, row.test_frames)),
-            errors(row.median_translation_m, row.median_rotation_deg),
-            errors(row.mean_translation_m, row.mean_rotation_deg),
-            percent(row.success_rate),
+            average.name,
+            average.method + (" (refined poses)" if average.truth == "refined" else ""),
+            str(average.sequences),
+            str(average.keyframes),
+            str(average.queries),
+            percent(average.success_rate),
+            str(average.false_localizations),
+            errors(average.median_translation_m, average.median_rotation_deg),
+            errors(average.mean_translation_m, average.mean_rotation_deg),
+            percent(average.recall_5cm_5deg),
         )
-        for row in PAPER_TABLE_3
+        for average in found
     ]
+    headers = ("average", "method", "recordings", "keyframes", "queries", "localized", "false")
+    return Grid(
+        "Averages",
+        (*headers, "median m / °", "mean m / °", "5 cm 5°"),
+        rows,
+        "Plain means of the figures of the recordings, each counting once, also of medians: as in the paper's Table 3. "
+        "Keyframes, queries and false localizations are sums.",
+    )
+
+
+def retrieval_grid(results: Sequence[EvaluationResult]) -> Grid:
+    """How often a keyframe that sees the place came among the first 1, 3, 10."""
+    rows = []
     for result in results:
-        rows.append(
-            (
-                result.recording,
-                result.method,
-                str(result.frames),
-                str(result.keyframes),
-                str(result.queries),
-                errors(result.median_translation_m, result.median_rotation_deg),
-                errors(result.mean_translation_m, result.mean_rotation_deg),
-                percent(result.success_rate),
-            )
-        )
-    return rows
+        found = result.retrieval
+        if found is not None:
+            shares = (percent(found.first_1), percent(found.first_3), percent(found.first_10))
+            counts = (str(result.keyframes), f"{found.queries} / {result.queries}")
+            rows.append((result.recording, name_of(result), *counts, *shares))
+    return Grid(
+        "Retrieval by itself",
+        ("recording", "method", "keyframes", "queries", "first 1", "first 3", "first 10"),
+        rows,
+        "Share of queries with a keyframe within 0.3 m and 20° among the first 1, 3 and 10 that a method would match. "
+        "Counted are the queries for which the map has such a keyframe: so many / all.",
+    )
 
 
-def paper_table(results: Sequence[EvaluationResult] = ()) -> Table:
-    """The paper's Table 3 with `results` below it, for the terminal. Other sequences: a region, not a ranking."""
-    headers = ("", "frames / key / test", *PAPER_HEADERS[5:])
+def truth_grids(results: Sequence[EvaluationResult]) -> list[Grid]:
+    """How far the given poses are from the refined ones, and the errors against both."""
+    compared = [result for result in results if result.disagreement is not None]
+    first = {result.recording: result.disagreement for result in compared}
     rows = [
-        (sequence if method == PAPER_METHOD else f"{method}, {sequence}", " / ".join(counts), *figures)
-        for sequence, method, counts, figures in ((row[0], row[1], row[2:5], row[5:]) for row in paper_rows(results))
+        (
+            recording,
+            f"{found.refined} / {found.frames}",
+            errors(found.median_translation_m, found.median_rotation_deg),
+            errors(found.p90_translation_m, found.p90_rotation_deg),
+            errors(found.max_translation_m, found.max_rotation_deg),
+            errors(found.median_step_translation_m, found.median_step_rotation_deg),
+        )
+        for recording, found in first.items()
+        if found is not None
     ]
-    return _rich(headers, rows, "Beside Table 3 of the paper (keyframes and queries of one sequence)")
+    headers = ("recording", "refined frames", "median m / °", "90 % m / °", "largest m / °", "frame to frame m / °")
+    note = "How far the given poses of the frames are from those that structure from motion finds."
+    errors_rows = []
+    for result in compared:
+        other = result.other_errors
+        own = (errors(result.median_translation_m, result.median_rotation_deg), percent(result.recall["5cm_5deg"]))
+        against = (
+            (NOTHING, NOTHING)
+            if other is None
+            else (errors(other.median_translation_m, other.median_rotation_deg), percent(other.recall["5cm_5deg"]))
+        )
+        given, refined = (own, against) if result.truth == "given" else (against, own)
+        errors_rows.append((result.recording, result.method, str(result.keyframes), result.truth, *given, *refined))
+    return [
+        Grid("Given and refined poses", headers, rows, note, text_columns=1),
+        Grid(
+            "Errors against both truths",
+            ("recording", "method", "keyframes", "map", "given: median", "5 cm 5°", "refined: median", "5 cm 5°"),
+            errors_rows,
+            "Map: whose poses the keyframes have. Each row is one set of answers, measured against both truths.",
+        ),
+    ]
 
 
-def paper_markdown(results: Sequence[EvaluationResult] = ()) -> str:
-    """The paper's Table 3 with `results` below it, as Markdown."""
-    return _markdown(PAPER_HEADERS, paper_rows(results))
+def ablation_grids(results: Sequence[EvaluationResult]) -> list[Grid]:
+    """What each layer brings, one table per recording, number of keyframes and truth."""
+    groups: dict[tuple[str, int | None, str], dict[str, EvaluationResult]] = {}
+    for result in results:
+        key = result.recording, result.keyframes_asked, result.truth
+        groups.setdefault(key, {})[result.method] = result
+    headers = ("filter", "keypoints", "method", "localized", "false", "median m / °", "mean m / °", "5 cm 5°")
+    grids = []
+    for (recording, _, _), found in groups.items():
+        rows = [
+            (filter_name, keypoints, method, *_ablation_cells(found[method]))
+            for filter_name, keypoints, method in ABLATION
+            if method in found
+        ]
+        first = next(iter(found.values()))
+        title = f"Ablation on {recording}, {first.keyframes} keyframes, {first.queries} queries"
+        grids.append(Grid(title, (*headers, "ranked", "matched", "first 1 / 3 / 10"), rows, text_columns=3))
+    return grids
 
 
-def percent(share: float | None) -> str:
-    return NOTHING if share is None else f"{100 * share:.1f} %"
+def _ablation_cells(result: EvaluationResult) -> tuple[str, ...]:
+    found = result.retrieval
+    firsts = (NOTHING,) if found is None else (percent(found.first_1), percent(found.first_3), percent(found.first_10))
+    return (
+        percent(result.success_rate),
+        str(result.false_localizations),
+        errors(result.median_translation_m, result.median_rotation_deg),
+        errors(result.mean_translation_m, result.mean_rotation_deg),
+        percent(result.recall["5cm_5deg"]),
+        percent(result.ranked_share),
+        NOTHING if result.keyframes_matched is None else f"{result.keyframes_matched:g}",
+        " / ".join(firsts),
+    )
 
 
-def errors(metres: float | None, degrees: float | None) -> str:
-    return NOTHING if metres is None or degrees is None else f"{metres:.4f} / {degrees:.2f}"
+def rich_table(grid: Grid) -> Table:
+    """A grid for the terminal."""
+    table = _rich(grid.headers, grid.rows, grid.title)
+    table.caption = grid.note or None
+    table.caption_justify = "left"
+    return table
 
 
-def whole(value: float | None) -> str:
-    return NOTHING if value is None else f"{value:.0f}"
+def grid_markdown(grid: Grid) -> str:
+    """A grid as a Markdown table."""
+    return _markdown(grid.headers, grid.rows)
 
 
 def _rich(headers: Sequence[str], rows: Sequence[Sequence[str]], title: str | None) -> Table:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import csv
 import io
 import json
@@ -15,6 +16,9 @@ import pytest
 from rich.console import Console
 
 from semdb.errors import UsageError
+from semdb.evaluation.averages import averages
+from semdb.evaluation.comparisons import table_1, table_3, table_4
+from semdb.evaluation.failures import explain, sharpness
 from semdb.evaluation.metrics import EvaluationResult, QueryResult, summarise
 from semdb.evaluation.plots import (
     SERIES,
@@ -25,17 +29,20 @@ from semdb.evaluation.plots import (
     series_names,
     trajectory_plot,
 )
-from semdb.evaluation.report import worst_queries, write_report
+from semdb.evaluation.published import PAPER_TABLE_3
+from semdb.evaluation.report import write_report
 from semdb.evaluation.tables import (
     HEADERS,
-    PAPER_TABLE_3,
+    average_grid,
     by_keyframes,
-    paper_markdown,
-    paper_table,
+    grid_markdown,
     result_row,
     results_markdown,
     results_table,
+    retrieval_grid,
+    rich_table,
 )
+from semdb.evaluation.worst import worst_queries
 from semdb.geometry import pose_from, so3_exp
 from semdb.types import ModelInfo, Verdict
 
@@ -45,7 +52,7 @@ def query(index: int, metres: float | None, verdict: Verdict = Verdict.LOCALIZED
     degrees = None if metres is None else 20 * metres
     return QueryResult(
         f"rgb/{index}.png", index, verdict, metres, degrees, 3, 10 * index, 0.9, "filtered", 0.25, 3,
-        {"match": 5.0, "total": 40.0}, reason, None, truth,
+        {"match": 5.0, "total": 40.0}, reason, true_world_from_camera=truth,
     )  # fmt: skip
 
 
@@ -79,8 +86,10 @@ def test_shares_count_queries_without_a_pose_as_never_within() -> None:
 
 def test_curves_of_the_cumulative_plot() -> None:
     figure = cumulative_plot([result(), result("cnn")])
-    left, right = figure.axes
+    left, right, near, turned_near = figure.axes
     assert (left.get_xlim(), right.get_xlim()) == ((0, 0.5), (0, 10))
+    assert (near.get_xlim(), turned_near.get_xlim()) == ((0, 0.05), (0, 2.5))
+    assert np.asarray(near.get_lines()[0].get_ydata(), float)[-1] == pytest.approx(0.5)  # 1 to 5 cm
     curve = left.get_lines()[0]
     x, y = np.asarray(curve.get_xdata(), float), np.asarray(curve.get_ydata(), float)
     assert (x[0], x[-1]) == (0.0, 0.5)
@@ -148,7 +157,6 @@ def test_tables_fit_a_terminal_of_80_characters() -> None:
     for renderable in (
         results_table(three, "Evaluation"),
         results_table([*three, result("cnn"), result(recording="desk")], "Evaluation"),
-        paper_table(three),
     ):
         text = printed(renderable)
         assert max(len(line.rstrip()) for line in text.splitlines()) <= 80
@@ -158,7 +166,7 @@ def test_tables_fit_a_terminal_of_80_characters() -> None:
 
 def test_order_by_number_of_keyframes() -> None:
     ordered = by_keyframes([result(keyframes=50), result("cnn", 12), result(keyframes=12)])
-    assert [(item.method, item.keyframes) for item in ordered] == [("cnn", 12), ("semdb", 12), ("semdb", 50)]
+    assert [(item.method, item.keyframes) for item in ordered] == [("semdb", 12), ("semdb", 50), ("cnn", 12)]
 
 
 def test_figures_of_the_paper() -> None:
@@ -166,7 +174,7 @@ def test_figures_of_the_paper() -> None:
     assert len(sequences) == 14
     office = next(row for row in sequences if row.sequence.endswith("office room kt1"))
     assert (office.keyframes, office.test_frames, office.success_rate) == (47, 600, 0.7794)
-    text = paper_markdown([result()])
+    text = grid_markdown(table_3([result()]))
     assert "freiburg1_room" in text
     assert text.splitlines()[-1].startswith("| room ")
 
@@ -194,18 +202,19 @@ class Page(HTMLParser):
 
 
 def test_report_is_complete_and_self_contained(tmp_path: Path) -> None:
+    picture = cv2.imencode(".jpg", np.full((20, 30, 3), 200, np.uint8))[1].tobytes()
     results = [result(keyframes=50), result(keyframes=12), result(recording="desk")]
-    results[0] = replace(results[0], models=(ModelInfo("features", "sift", ""),))
+    results[0] = replace(results[0], models=(ModelInfo("features", "sift", ""),), pictures={("", 8): picture})
     steps: list[tuple[int, int]] = []
     page = write_report(
         tmp_path / "new" / "report", results, settings={"SEMDB_FEATURES": "surf <x>"},
-        picture_of=lambda _, q: figure_png(inlier_plot(EMPTY)) if q.frame_index == 8 else None,
-        progress=lambda done, total: steps.append((done, total)),
+        failures={"kitchen": "no <depth>"}, progress=lambda done, total: steps.append((done, total)),
     )  # fmt: skip
     folder = page.parent
     names = sorted(path.name for path in folder.iterdir())
     assert names == sorted(
-        ["index.html", "results.json", "queries.csv", "errors-1.png", "errors-2.png"]
+        ["index.html", "results.json", "averages.json", "queries.csv", "errors-1.png", "errors-2.png", "timing.png"]
+        + ["confidence.png"]
         + [f"{kind}-{n}.png" for kind in ("trajectory", "inliers") for n in (1, 2, 3)]
     )
     assert steps == [(1, 3), (2, 3), (3, 3)]
@@ -219,13 +228,19 @@ def test_report_is_complete_and_self_contained(tmp_path: Path) -> None:
     parser.feed(text)
     assert parser.open == []
     images = [attributes for tag, attributes in parser.seen if tag == "img"]
-    assert len(images) == 2 + 2 * 3 + 3
-    assert all(str(image["src"]).startswith("data:image/png;base64,") for image in images)
-    assert not any(tag in ("script", "link", "a", "iframe") for tag, _ in parser.seen)
+    assert len(images) == 2 + 1 + 1 + 2 * 3 + 1  # errors, time, confidence, two per result, one query
+    assert sum(str(image["src"]).startswith("data:image/png;base64,") for image in images) == len(images) - 1
+    assert f"data:image/jpeg;base64,{base64.b64encode(picture).decode()}" in text
+    assert not any(tag in ("script", "link", "iframe") for tag, _ in parser.seen)
+    links = [attributes["href"] for tag, attributes in parser.seen if tag == "a"]
+    places = {f"#{attributes['id']}" for tag, attributes in parser.seen if tag == "h2"}
+    assert set(links) == places
     assert "surf &lt;x&gt;" in text
+    assert "<b>kitchen</b> was not evaluated: no &lt;depth&gt;" in text
     assert "<dt>features</dt><dd>surf abababababab, sift</dd>" in text
     assert "&lt;b&gt;two places&lt;/b&gt;" in text
-    assert "<b>" not in text
+    assert "Table 1" in text
+    assert "PoseNet" in text
 
 
 def test_report_of_an_empty_result(tmp_path: Path) -> None:
@@ -240,3 +255,67 @@ def test_report_errors_say_what_is_wrong(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UsageError, match=r"cannot be written to .*file"):
         write_report(tmp_path / "file", [EMPTY])
+
+
+def test_sequences_of_the_paper_stand_below_its_rows() -> None:
+    kt0 = replace(result(recording="lr_kt0"), sequence="ICL-NUIM living room kt0")
+    kt1 = replace(result(recording="lr_kt1"), sequence="ICL-NUIM living room kt1", median_translation_m=0.015)
+    grid = table_3([kt0, kt1], only_evaluated=True)
+    assert [row[:2] for row in grid.rows] == [
+        ("ICL-NUIM living room kt0", "the paper"),
+        ("ICL-NUIM living room kt0", "semdb"),
+        ("ICL-NUIM living room kt1", "the paper"),
+        ("ICL-NUIM living room kt1", "semdb"),
+        ("ICL-NUIM, all", "the paper"),
+        ("ICL-NUIM, mean of 2", "semdb"),
+        ("ICL-NUIM, all", "Chen et al."),
+    ]
+    assert grid.ours == {1, 3, 5}
+    assert grid.rows[5][5] == "0.0300 / 0.90"
+    assert len(table_3([kt0, result(recording="desk")]).rows) == len(PAPER_TABLE_3) + 2
+    rooms = table_4([kt0, kt1])
+    assert rooms.rows[-1] == ("semdb, this run", "0.1100 / 2.20 (2 of 4)", "-")
+    assert table_1([kt0]).rows[-1] == ("ICL-NUIM living room kt0", "this run", "250", "25", "10")
+
+
+def test_averages_are_plain_means_over_recordings() -> None:
+    room, desk = result(), replace(result(recording="desk"), median_translation_m=0.005, success_rate=1.0)
+    [mean] = averages([room, desk])
+    assert (mean.name, mean.sequences, mean.queries) == ("all recordings", 2, 20)
+    assert mean.median_translation_m == pytest.approx((0.045 + 0.005) / 2)
+    assert mean.success_rate == pytest.approx(0.9)
+    assert averages([room]) == []
+    assert averages([room, replace(desk, method="cnn")]) == []
+    assert averages([room, replace(desk, median_translation_m=None)])[0].median_translation_m is None
+    assert average_grid(averages([room, desk])).rows[0][:3] == ("all recordings", "semdb", "2")
+    assert retrieval_grid([room]).rows == []
+    assert "all recordings" in printed(rich_table(average_grid([mean])), 200)
+
+
+def test_the_averages_of_the_paper_are_made_the_same_way() -> None:
+    """Its rows "all" repeat as plain means of its sequences, medians too, within one unit of the last digit."""
+    for collection in ("ICL-NUIM", "TUM RGB-D"):
+        rows = [row for row in PAPER_TABLE_3 if row.collection == collection and row.test_frames]
+        [whole] = [row for row in PAPER_TABLE_3 if row.sequence == f"{collection}, all" and row.method == "the paper"]
+        for field in ("median_translation_m", "median_rotation_deg", "mean_translation_m", "mean_rotation_deg"):
+            mean = np.mean([getattr(row, field) for row in rows])
+            assert mean == pytest.approx(getattr(whole, field), abs=1.01e-4)
+        assert np.mean([row.success_rate for row in rows]) == pytest.approx(whole.success_rate, abs=1e-4)
+
+
+def test_order_of_the_worst_and_why() -> None:
+    wrong = replace(query(1, 0.6), keyframe_in_reach=True, nearest_keyframe_m=0.1, nearest_keyframe_deg=3.0)
+    assert explain(wrong) == "a wrong pose was trusted (10 inliers)"
+    lost = replace(query(2, None, Verdict.FAILED), keyframe_in_reach=False, nearest_keyframe_m=0.8,
+                   nearest_keyframe_deg=31.2, sharpness=20.0)  # fmt: skip
+    assert explain(lost, 100.0) == (
+        "the map does not know the place well: the nearest keyframe is 0.80 m and 31° away; too little agreed "
+        "(20 inliers); the image is blurred: sharpness 20% of the usual"
+    )
+    missed = replace(wrong, retrieves=True, retrieval_rank=None)
+    assert explain(missed).startswith("retrieval missed: no keyframe within 0.3 m and 20°")
+    late = replace(wrong, retrieves=True, retrieval_rank=7)
+    assert explain(late).startswith("the right keyframe came 7., but only 3 were matched")
+    edges = np.zeros((40, 40, 3), np.uint8)
+    edges[:, 20:] = 255
+    assert sharpness(cv2.GaussianBlur(edges, (0, 0), 3)) < 0.1 * sharpness(edges)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from semdb.evaluation.methods import method_named
-from semdb.evaluation.runner import _LocalizerRun
+from semdb.evaluation.runs import LocalizerRun
 from semdb.types import Localization, Verdict
 
 
@@ -38,10 +38,12 @@ def test_total_is_the_whole_time_of_a_query() -> None:
     cache = SimpleNamespace(poses=lambda: ([1, 2], np.stack([np.eye(4)] * 2)))
     localizer: Any = SimpleNamespace(cache=cache, localize=lambda _: answer_after(0.05))
     frame: Any = SimpleNamespace(
-        name="a", index=7, image=None, depth=None, camera=None, instances=None, world_from_camera=np.eye(4)
-    )
-    run = _LocalizerRun(method_named("semdb"), describer, localizer, query_depth=False)
-    result = run.answer(frame, 10.0, {id(describer): (description, 9.0)})
+        name="a", index=7, image=np.zeros((4, 4, 3), np.uint8), depth=None, camera=None, instances=None,
+        world_from_camera=None, timestamp_ns=5,
+    )  # fmt: skip
+    run = LocalizerRun(method_named("semdb"), describer, localizer, query_depth=False)
+    result, _ = run.answer("room", frame, 10.0, {(id(describer), False): (description, 9.0)})
+    assert (result.recording, result.timestamp_ns) == ("room", 5)
     assert result.timing_ms["total"] >= 10 + 9 + 50
     assert set(result.timing_ms) == {
         "decode",
@@ -54,4 +56,4 @@ def test_total_is_the_whole_time_of_a_query() -> None:
         "pose",
         "total",
     }
-    assert run.keyframes == 2
+    assert len(run.poses) == 2

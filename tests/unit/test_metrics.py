@@ -10,18 +10,19 @@ import numpy as np
 import pytest
 
 from semdb.errors import UsageError
+from semdb.evaluation.files import to_json, write_json, write_queries_csv
 from semdb.evaluation.metrics import (
     TIMING_STAGES,
     EvaluationResult,
     QueryResult,
     query_result,
     summarise,
-    to_json,
-    write_json,
-    write_queries_csv,
+    with_other_truth,
+    with_reach,
 )
+from semdb.evaluation.retrieval import Retrieval, near_keyframes, reach
 from semdb.geometry import pose_from, so3_exp
-from semdb.types import Candidate, Localization, ModelInfo, Verdict
+from semdb.types import Candidate, FloatArray, Localization, ModelInfo, Verdict
 
 MODELS = (ModelInfo("detector", "recorded", ""), ModelInfo("features", "sift", "ab12", '{"nfeatures":1500}'))
 
@@ -114,10 +115,14 @@ def test_json_has_exactly_the_contract_keys_and_no_nan() -> None:
         "recording", "protocol", "method", "models", "frames", "keyframes", "queries", "localized",
         "false_localizations", "success_rate", "median_translation_m", "median_rotation_deg", "mean_translation_m",
         "mean_rotation_deg", "recall", "ranked_share", "keyframes_matched", "stages", "timing_ms", "per_query",
+        "sequence", "keyframes_asked", "query_depth", "map_recordings", "query_recordings", "retrieval", "truth",
+        "other_errors", "disagreement",
     }  # fmt: skip
     assert set(document["per_query"][0]) == {
         "frame", "frame_index", "verdict", "translation_m", "rotation_deg", "candidate", "inliers", "confidence",
-        "stage", "ranked_share", "keyframes_matched", "timing_ms", "reason",
+        "stage", "ranked_share", "keyframes_matched", "timing_ms", "reason", "recording", "timestamp_ns",
+        "candidate_recording", "keyframe_in_reach", "retrieval_rank", "nearest_keyframe_m", "nearest_keyframe_deg",
+        "sharpness", "other_translation_m", "other_rotation_deg",
     }  # fmt: skip
     assert document["models"]["features"] == {"name": "sift", "sha256": "ab12", "config": {"nfeatures": 1500}}
     assert document["per_query"][0]["verdict"] == "localized"
@@ -131,6 +136,9 @@ def test_one_result_is_an_object_and_several_are_a_list(tmp_path: Path) -> None:
     write_json(tmp_path / "two.json", [summary(CASE), summary([])])
     assert json.loads((tmp_path / "one.json").read_text())["localized"] == 4
     assert [item["queries"] for item in json.loads((tmp_path / "two.json").read_text())] == [6, 0]
+    write_json(tmp_path / "first.json", [summary(CASE)], several=True)
+    assert [item["queries"] for item in json.loads((tmp_path / "first.json").read_text())] == [6]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["first.json", "one.json", "two.json"]
 
 
 def test_csv_of_queries(tmp_path: Path) -> None:
@@ -171,3 +179,53 @@ def test_query_result_without_pose_or_truth() -> None:
     assert (result.translation_m, result.candidate, result.is_false) == (None, None, False)
     found = Localization(Verdict.LOCALIZED, "m", np.eye(4), None, 0.9, 30, "all", (), 1.0, 5, "", {})
     assert query_result("f", 5, found, None).rotation_deg is None
+
+
+def at(x: float, degrees: float = 0.0) -> FloatArray:
+    return pose_from(so3_exp([0.0, np.radians(degrees), 0.0]), [x, 0.0, 0.0])
+
+
+def test_a_keyframe_sees_the_place_within_0_3_m_and_20_degrees() -> None:
+    poses = np.stack([at(0.29, 19), at(0.31), at(0.0, 21), at(0.1)])
+    assert near_keyframes(at(0), poses).tolist() == [True, False, False, True]
+    found = reach(at(0), poses, [1, 2, 3, 0])
+    assert (found.reachable, found.rank) == (True, 3)
+    assert (found.nearest_translation_m, found.nearest_rotation_deg) == pytest.approx((0.1, 0.0), abs=1e-6)
+    assert reach(at(0), poses, [1, 2]).rank is None
+    assert reach(at(0), poses, [1] * 10 + [3]).rank is None  # only the first ten count
+    assert reach(at(5), poses, [0, 1, 2, 3]).reachable is False
+    assert reach(at(0), poses, None).rank is None
+
+
+def test_retrieval_counts_only_queries_with_a_keyframe_in_reach() -> None:
+    poses = np.stack([at(0), at(1), at(2)])
+    orders = {0.0: [0, 1, 2], 1.0: [2, 1, 0], 2.0: [1, 0], 9.0: [0, 1, 2]}
+    queries = [with_reach(query(0.01, 0.1), reach(at(x), poses, order), retrieves=True) for x, order in orders.items()]
+    assert [item.retrieval_rank for item in queries] == [1, 2, None, None]
+    assert [item.keyframe_in_reach for item in queries] == [True, True, True, False]
+    assert summary(queries).retrieval == Retrieval(3, pytest.approx(1 / 3), pytest.approx(2 / 3), pytest.approx(2 / 3))
+    told = with_reach(query(0.01, 0.1), reach(at(0), poses, None), retrieves=False)
+    assert summary([told]).retrieval is None
+    assert to_json(summary(queries))["retrieval"]["queries"] == 3
+
+
+def test_errors_against_the_other_truth() -> None:
+    answer = Localization(Verdict.LOCALIZED, "m", at(1.0), None, 0.9, 30, "all", (), 1.0, 5, "", {})
+    given = query_result("f", 5, answer, at(1.04))
+    both = with_other_truth(given, at(0.7, 1.0))
+    assert (both.translation_m, both.other_translation_m) == pytest.approx((0.04, 0.3))
+    assert both.other_rotation_deg == pytest.approx(1.0)
+    result = summary([both, query(None, None, Verdict.FAILED)])
+    assert result.recall["5cm_5deg"] == 0.5
+    assert result.other_errors is not None
+    assert result.other_errors.median_translation_m == pytest.approx(0.3)
+    assert result.other_errors.recall["5cm_5deg"] == 0.0
+    assert result.other_errors.false_localizations == 1
+    assert with_other_truth(given, None) == given
+    assert summary([given]).other_errors is None
+
+
+def test_a_right_pose_whatever_the_verdict() -> None:
+    assert query(0.25, 5.0, Verdict.AMBIGUOUS).has_right_pose is True
+    assert query(0.26, 0.0).has_right_pose is False
+    assert query(None, None, Verdict.FAILED).has_right_pose is False

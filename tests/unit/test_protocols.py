@@ -143,7 +143,7 @@ def wall(world_from_camera: FloatArray, index: int) -> Frame:
 def test_sift_reference_finds_a_rendered_view() -> None:
     keyframes = [wall(pose_from(np.eye(3), [x, 0, 0]), i) for i, x in enumerate((-0.4, -0.2, 0.0, 0.2, 0.4, 0.9))]
     truth = pose_from(so3_exp([0.02, 0.1, 0.03]), [0.1, 0.05, -0.1])
-    reference = SiftReference(keyframes, map_name="wall")
+    reference = SiftReference([("wall", keyframe) for keyframe in keyframes], map_name="wall")
     answer = reference.localize(wall(truth, 99))
     assert answer.verdict is Verdict.LOCALIZED
     assert answer.world_from_camera is not None
@@ -160,7 +160,7 @@ def test_sift_reference_finds_a_rendered_view() -> None:
 def test_sift_reference_fails_on_an_image_without_texture() -> None:
     frame = wall(np.eye(4), 0)
     grey = replace(frame, index=9, image=np.full_like(frame.image, 128))
-    answer = SiftReference([frame]).localize(grey)
+    answer = SiftReference([("wall", frame)]).localize(grey)
     assert (answer.verdict, answer.world_from_camera, answer.inliers) == (Verdict.FAILED, None, 0)
 
 
@@ -169,6 +169,6 @@ def test_sift_reference_says_what_is_missing() -> None:
     with pytest.raises(UsageError, match="at least one keyframe"):
         SiftReference([])
     with pytest.raises(FrameError, match=r"0\.png.*depth"):
-        SiftReference([replace(frame, depth=None)])
+        SiftReference([("wall", replace(frame, depth=None))])
     with pytest.raises(FrameError, match="true pose"):
-        SiftReference([frame]).localize(replace(frame, world_from_camera=None))
+        SiftReference([("wall", frame)]).localize(replace(frame, world_from_camera=None))

@@ -1,0 +1,163 @@
+"""Our rows beside those of the paper's Tables 1, 3 and 4."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from semdb.evaluation.averages import Average, averages, plain_mean
+from semdb.evaluation.formats import NOTHING, errors, percent
+from semdb.evaluation.metrics import EvaluationResult
+from semdb.evaluation.published import PAPER_SEQUENCES, PAPER_TABLE_3, PAPER_TABLE_4, PaperRow
+
+PAPER_HEADERS = ("sequence", "method", "frames", "keyframes", "queries", "median m / °", "mean m / °", "success")
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """A table as plain cells. `ours` are positions of rows that are results of this run, among those of others."""
+
+    title: str
+    headers: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    note: str = ""
+    text_columns: int = 2
+    ours: frozenset[int] = frozenset()
+
+
+def table_1(results: Sequence[EvaluationResult]) -> Grid:
+    """Frames, keyframes and test images: of the paper's sequences, and of the recordings of this run."""
+    rows: list[tuple[str, ...]] = [
+        (row.sequence, "the paper", str(row.raw_frames), str(row.keyframes), str(row.test_frames))
+        for row in PAPER_SEQUENCES.values()
+    ]
+    count = len(rows)
+    seen = {
+        (result.sequence or result.recording, result.frames, result.keyframes, result.queries) for result in results
+    }
+    rows += [(name, "this run", *map(str, counts)) for name, *counts in sorted(seen)]
+    return Grid(
+        "Table 1: frames, keyframes and test images",
+        ("sequence", "", "frames", "keyframes", "queries"),
+        rows,
+        ours=frozenset(range(count, len(rows))),
+    )
+
+
+def table_3(results: Sequence[EvaluationResult], *, only_evaluated: bool = False) -> Grid:
+    """Accuracy per sequence, each of ours below the paper's; then the recordings that the paper does not have.
+
+    With `only_evaluated`, without the sequences that this run does not have.
+    """
+    means = averages(results)
+    known = {result.sequence for result in results}
+    rows: list[tuple[str, ...]] = []
+    ours: set[int] = set()
+    for row in PAPER_TABLE_3:
+        own_means = [mean for mean in means if mean.name == row.sequence] if row.test_frames is None else []
+        collection = {PAPER_SEQUENCES[name].collection for name in known if name in PAPER_SEQUENCES}
+        evaluated = row.sequence in known if row.test_frames is not None else row.collection in collection
+        if only_evaluated and not evaluated:
+            continue
+        rows.append(_paper_cells(row))
+        if row.test_frames is not None:
+            own = [_own_cells(result) for result in results if result.sequence == row.sequence]
+        else:
+            own = [_mean_cells(mean) for mean in own_means] if row.method == "the paper" else []
+        ours |= set(range(len(rows), len(rows) + len(own)))
+        rows += own
+    rest = [] if only_evaluated else [_own_cells(result) for result in results if result.sequence is None]
+    ours |= set(range(len(rows), len(rows) + len(rest)))
+    rows += rest
+    return Grid(
+        "Table 3: accuracy",
+        PAPER_HEADERS,
+        rows,
+        "Keyframes and queries from one sequence; median and mean over localized queries. A recording that is not "
+        "among the paper's is another task: it shows the region, not a ranking. The paper gives Chen et al. as "
+        "averages only.",
+        ours=frozenset(ours),
+    )
+
+
+def paper_rows_evaluated(results: Sequence[EvaluationResult]) -> Grid:
+    """`table_3` for the terminal: the paper's sequences that were evaluated; no rows where there is none."""
+    if not any(result.sequence for result in results):
+        return Grid("", PAPER_HEADERS, [])
+    return table_3(results, only_evaluated=True)
+
+
+def table_4(results: Sequence[EvaluationResult]) -> Grid:
+    """Mean errors on the rooms of ICL-NUIM beside poses regressed by networks; ours where its sequences were run."""
+    rows = [
+        (row.method, errors(row.living_translation_m, row.living_rotation_deg),
+         errors(row.office_translation_m, row.office_rotation_deg))
+        for row in PAPER_TABLE_4
+    ]  # fmt: skip
+    count = len(rows)
+    methods = dict.fromkeys(
+        (result.method, result.truth) for result in results if "ICL-NUIM" in (result.sequence or "")
+    )
+    for method, truth in methods:
+        cells = []
+        for room in ("living", "office"):
+            chosen = [
+                result
+                for result in results
+                if (result.method, result.truth) == (method, truth) and f"ICL-NUIM {room}" in (result.sequence or "")
+            ]
+            number = len({result.sequence for result in chosen})
+            mean = errors(
+                plain_mean(result.mean_translation_m for result in chosen),
+                plain_mean(result.mean_rotation_deg for result in chosen),
+            )
+            cells.append(mean if number in (0, 4) else f"{mean} ({number} of 4)")
+        rows.append((f"{method}, this run", cells[0], cells[1]))
+    note = "Networks that regress a pose, trained on each room; mean over the four sequences of each room."
+    if not methods:
+        note += " This run has no sequence of ICL-NUIM."
+    return Grid(
+        "Table 4: mean error on ICL-NUIM, m / °",
+        ("method", "living room", "office room"),
+        rows,
+        note,
+        text_columns=1,
+        ours=frozenset(range(count, len(rows))),
+    )
+
+
+def _paper_cells(row: PaperRow) -> tuple[str, ...]:
+    return (
+        row.sequence,
+        row.method,
+        *(NOTHING if count is None else str(count) for count in (row.raw_frames, row.keyframes, row.test_frames)),
+        errors(row.median_translation_m, row.median_rotation_deg),
+        errors(row.mean_translation_m, row.mean_rotation_deg),
+        percent(row.success_rate),
+    )
+
+
+def _own_cells(result: EvaluationResult) -> tuple[str, ...]:
+    return (
+        result.sequence or result.recording,
+        result.method + (" (refined poses)" if result.truth == "refined" else ""),
+        str(result.frames),
+        str(result.keyframes),
+        str(result.queries),
+        errors(result.median_translation_m, result.median_rotation_deg),
+        errors(result.mean_translation_m, result.mean_rotation_deg),
+        percent(result.success_rate),
+    )
+
+
+def _mean_cells(mean: Average) -> tuple[str, ...]:
+    return (
+        f"{mean.name.removesuffix(', all')}, mean of {mean.sequences}",
+        mean.method + (" (refined poses)" if mean.truth == "refined" else ""),
+        NOTHING,
+        str(mean.keyframes),
+        str(mean.queries),
+        errors(mean.median_translation_m, mean.median_rotation_deg),
+        errors(mean.mean_translation_m, mean.mean_rotation_deg),
+        percent(mean.success_rate),
+    )

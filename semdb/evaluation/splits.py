@@ -1,0 +1,98 @@
+"""Which recordings make the map and which are asked about: the split files of 7-Scenes, or folders by name."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from semdb.errors import RecordingError, UsageError
+from semdb.evaluation.tasks import PaperPlan, Plan, SplitPlan
+from semdb.recordings import open_recordings
+from semdb.recordings.base import Recording
+from semdb.types import Camera
+
+TRAIN_FILE, TEST_FILE = "TrainSplit.txt", "TestSplit.txt"
+_LINE = re.compile(r"(?:sequence|seq)[-_ ]?0*(\d+)", re.IGNORECASE)
+
+
+def paper_plans(path: Path, camera: Camera | None = None) -> list[Plan]:
+    """Protocol `paper`: one plan per recording under `path`. Raises RecordingError."""
+    return [PaperPlan(recording) for recording in open_recordings(path, camera)]
+
+
+def scene_plan(path: Path, camera: Camera | None = None) -> SplitPlan:
+    """Protocol `split` of a 7-Scenes scene: map from the sequences of TrainSplit.txt, queries from TestSplit.txt.
+
+    Raises UsageError where the two files are missing, RecordingError that names the line of a sequence that is not
+    there, or that is in both.
+    """
+    missing = [name for name in (TRAIN_FILE, TEST_FILE) if not (path / name).is_file()]
+    if missing:
+        raise UsageError(
+            f"{path}: protocol split needs {' and '.join(missing)} there (as in a scene of 7-Scenes), or say "
+            "--map-from FOLDER --query-from FOLDER"
+        )
+    chosen = [split_lines(path / name) for name in (TRAIN_FILE, TEST_FILE)]
+    both = set(chosen[0]) & set(chosen[1])
+    if both:
+        raise RecordingError(f"{path}: sequence{min(both)} is in {TRAIN_FILE} and in {TEST_FILE}")
+    halves = [
+        tuple(_sequence(path, name, number, camera) for number in numbers)
+        for name, numbers in zip((TRAIN_FILE, TEST_FILE), chosen, strict=True)
+    ]
+    return SplitPlan(path.resolve().name, halves[0], halves[1])
+
+
+def split_lines(path: Path) -> list[int]:
+    """The numbers of the sequences that a split file names. Raises RecordingError with the line."""
+    numbers = []
+    for row, line in enumerate(path.read_text(encoding="utf-8-sig", errors="replace").splitlines(), start=1):
+        if not line.strip():
+            continue
+        match = _LINE.fullmatch(line.strip())
+        if match is None:
+            raise RecordingError(f"{path}, line {row}: {line.strip()!r} is no sequence; a line is like 'sequence1'")
+        numbers.append(int(match.group(1)))
+    if not numbers:
+        raise RecordingError(f"{path}: names no sequence")
+    return list(dict.fromkeys(numbers))
+
+
+def folder_plan(map_from: Sequence[Path], query_from: Sequence[Path], camera: Camera | None = None) -> SplitPlan:
+    """Protocol `split` of recordings in one world frame that the caller names. Raises UsageError, RecordingError."""
+    if not map_from or not query_from:
+        present, absent = ("--map-from", "--query-from") if map_from else ("--query-from", "--map-from")
+        raise UsageError(f"{present} needs {absent} too: the one makes the map, the other is asked about")
+    halves = [[found for path in paths for found in open_recordings(path, camera)] for paths in (map_from, query_from)]
+    same = {found.path.resolve() for found in halves[0]} & {found.path.resolve() for found in halves[1]}
+    if same:
+        raise UsageError(
+            f"{min(same)}: is given to --map-from and to --query-from; for keyframes and queries of one recording "
+            "use --protocol paper"
+        )
+    _tell_apart([*halves[0], *halves[1]])
+    names = ", ".join(found.name for found in halves[1])
+    return SplitPlan(names, tuple(halves[0]), tuple(halves[1]))
+
+
+def _sequence(path: Path, name: str, number: int, camera: Camera | None) -> Recording:
+    for folder in (f"seq-{number:02d}", f"seq-{number}", f"seq{number:02d}", f"seq{number}"):
+        if (path / folder).is_dir():
+            [recording] = open_recordings(path / folder, camera)
+            return recording
+    raise RecordingError(f"{path / name}: names sequence{number}, but there is no folder {path / f'seq-{number:02d}'}")
+
+
+def _tell_apart(recordings: Sequence[Recording]) -> None:
+    """Recordings of one name get that of the folder around them in front, and a number where that is not enough."""
+    names = [recording.name for recording in recordings]
+    taken: set[str] = set()
+    for recording in recordings:
+        if names.count(recording.name) > 1:
+            recording.name = f"{recording.path.resolve().parent.name}-{recording.path.resolve().name}"
+        name, number = recording.name, 1
+        while recording.name in taken:
+            number += 1
+            recording.name = f"{name}-{number}"
+        taken.add(recording.name)
