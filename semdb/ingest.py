@@ -1,31 +1,35 @@
 """The pipeline from a recording to rows: select keyframes, plan, describe, store. Called by the CLI and the workers.
 
 The plan is written before the first keyframe, each keyframe with all its children in one transaction, so a run
-that is cut off anywhere is finished by running it again.
+that is cut off anywhere is finished by running it again. `semdb.item_work` does the work that is planned.
 """
 
 from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from semdb.database import items
 from semdb.database.planning import check_models
-from semdb.database.records import KeyframeRecord, PlannedRecording, RecordingPlan
+from semdb.database.records import PlannedRecording, RecordingPlan
+from semdb.database.requeue import requeue_failed
 from semdb.database.store import Store, open_store
-from semdb.errors import FrameError, UsageError
+from semdb.errors import UsageError
+from semdb.item_work import STAGES, Item, work_off
 from semdb.keyframes import select_keyframes
-from semdb.model_choice import settings_of_map, specs_for_ingest
+from semdb.model_choice import ModelSpecs, settings_of_map, specs_for_ingest
 from semdb.perception.describe import Describer, describer_from_specs
 from semdb.recordings import open_recordings
 from semdb.recordings.base import DroppedFrame, FrameEntry, Recording
 from semdb.settings import Settings
-from semdb.types import Camera, Frame, ModelInfo
+from semdb.types import Camera, ModelInfo
 
 Progress = Callable[[str, int, int], None]  # what, done, total
+MOST_DESCRIBERS = 4  # each holds networks of its own
+SECONDS_BETWEEN_LOOKS = 0.5  # at what other workers still have
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +48,11 @@ class IngestOptions:
 
 @dataclass(slots=True)
 class IngestSummary:
-    """What became of one recording. `seconds` are wall times of stages; networks' time is in detect and encode."""
+    """What became of one recording. `elsewhere` counts keyframes that other processes stored meanwhile.
+
+    `seconds` are the wall times of stages, summed over keyframes: stages overlap, so they are more than the `total`.
+    Networks' time is in detect and encode.
+    """
 
     map_name: str
     recording: str
@@ -55,6 +63,7 @@ class IngestSummary:
     already_stored: int
     models: tuple[ModelInfo, ...]
     stored: int = 0
+    elsewhere: int = 0
     objects: int = 0
     keypoints: int = 0
     failed: dict[int, str] = field(default_factory=dict)
@@ -83,7 +92,7 @@ def ingest_recordings(
             raise UsageError(f"--name names one recording, but {len(recordings)} were found")
         recordings[0].name = options.name
     _check_names(recordings)
-    describers: dict[object, Describer] = {}
+    describers: dict[object, list[Describer]] = {}
     summaries: list[IngestSummary] = []
     with open_store(settings.database_url, create=True) as store:
         for recording in recordings:
@@ -94,17 +103,27 @@ def ingest_recordings(
             own = settings_of_map(settings, map_models)
             key = (specs, own.score_threshold, own.max_keypoints, own.classes, own.dynamic)
             if key not in describers:
-                describers[key] = describer_from_specs(specs.detector, specs.encoder, specs.features, own)
+                describers[key] = make_describers(specs, own)
             summary = ingest_recording(recording, store, describers[key], options, progress=progress)
             summary.notes = (*recording.notes, *specs.notes)
             summaries.append(summary)
     return summaries
 
 
+def make_describers(specs: ModelSpecs, settings: Settings) -> list[Describer]:
+    """Equal describers for as many threads as `settings` allow, which they share: rows do not depend on how many.
+
+    Two networks with one thread each do more in a second than one with two. Raises UsageError, ModelError.
+    """
+    count = min(settings.threads, MOST_DESCRIBERS)
+    own = settings.model_copy(update={"threads": settings.threads // count})
+    return [describer_from_specs(specs.detector, specs.encoder, specs.features, own) for _ in range(count)]
+
+
 def ingest_recording(
     recording: Recording,
     store: Store,
-    describer: Describer,
+    describer: Describer | Sequence[Describer],
     options: IngestOptions,
     *,
     progress: Progress | None = None,
@@ -112,15 +131,51 @@ def ingest_recording(
 ) -> IngestSummary:
     """Ingests one open recording. Frames that cannot be read are `failed` with their reason; the rest goes on.
 
-    `entries` are the keyframes where the caller has selected them.
+    `entries` are the keyframes where the caller has selected them. Several equal describers work side by side. Other
+    processes may ingest the same recording: they share the work, and this one returns when all of it is done.
+    """
+    describers = (describer,) if isinstance(describer, Describer) else tuple(describer)
+    started = time.perf_counter()
+    summary, todo = plan_ingest(recording, store, describers[0].models, options, progress=progress, entries=entries)
+    selected = time.perf_counter()
+    summary.seconds = {"select": selected - started, **dict.fromkeys(STAGES, 0.0)}
+    requeue_failed(store.engine, summary.recording_id)
+    done = 0
+    while True:
+        for item in work_off(recording, summary.recording_id, store, describers):
+            _count(summary, item)
+            done += 1
+            if progress is not None:
+                progress(f"ingesting {recording.name}", min(done, todo), todo)
+        if not any(items.left(store.engine, summary.recording_id)):
+            break
+        time.sleep(SECONDS_BETWEEN_LOOKS)  # others are still at theirs, or have died: then their leases run out
+    store.finish_recording(summary.recording_id)
+    summary.failed = {item.frame_index: item.error for item in store.failed_items(summary.recording_id)}
+    summary.elsewhere = max(0, todo - summary.stored - len(summary.failed))
+    summary.seconds["total"] = time.perf_counter() - selected
+    return summary
+
+
+def plan_ingest(
+    recording: Recording,
+    store: Store,
+    models: tuple[ModelInfo, ...],
+    options: IngestOptions,
+    *,
+    progress: Progress | None = None,
+    entries: Sequence[FrameEntry] | None = None,
+) -> tuple[IngestSummary, int]:
+    """Selects keyframes, unless `entries` are given or a plan is stored, and writes the plan; nothing is described.
+
+    Returns a summary of which nothing is done yet, and how many keyframes are to be done. Raises as
+    `Store.plan_recording` does.
     """
     map_name = options.map_name or default_map_name(recording)
-    check_models(map_models_of(store, map_name), describer.models, f"the map {map_name!r}")
-    started = time.perf_counter()
+    check_models(map_models_of(store, map_name), models, f"the map {map_name!r}")
     if entries is None:
         entries = _planned_entries(recording, store, map_name, options, progress)
-    selected = time.perf_counter()
-    plan = _plan(recording, store, map_name, describer, entries)
+    plan = _plan(recording, store, map_name, models, entries)
     summary = IngestSummary(
         map_name=map_name,
         recording=recording.name,
@@ -129,30 +184,19 @@ def ingest_recording(
         usable_frames=len(recording.entries) - len(recording.decode_failures),
         planned=len(entries),
         already_stored=len(plan.stored),
-        models=describer.models,
+        models=models,
         dropped=(*recording.dropped, *recording.decode_failures),
     )
-    summary.seconds = {
-        "select": selected - started,
-        "read": 0.0,
-        "detect": 0.0,
-        "encode": 0.0,
-        "features": 0.0,
-        "store": 0.0,
-    }
-    pending = set(plan.pending)
-    todo = [entry for entry in entries if entry.index in pending]
-    for done, (entry, result, seconds) in enumerate(_read_ahead(recording, todo), start=1):
-        summary.seconds["read"] += seconds
-        if isinstance(result, FrameError):
-            _fail(summary, store, entry, result)
-        else:
-            _describe_and_store(summary, store, describer, result)
-        if progress is not None:
-            progress(f"ingesting {recording.name}", done, len(todo))
-    store.finish_recording(plan.recording_id)
-    summary.seconds["total"] = time.perf_counter() - selected
-    return summary
+    return summary, len(plan.pending)
+
+
+def _count(summary: IngestSummary, item: Item) -> None:
+    for stage, seconds in item.seconds.items():
+        summary.seconds[stage] += seconds
+    if item.created:
+        summary.stored += 1
+        summary.objects += item.objects
+        summary.keypoints += item.keypoints
 
 
 def default_map_name(recording: Recording) -> str:
@@ -207,7 +251,7 @@ def _planned_entries(
 
 
 def _plan(
-    recording: Recording, store: Store, map_name: str, describer: Describer, entries: Sequence[FrameEntry]
+    recording: Recording, store: Store, map_name: str, models: tuple[ModelInfo, ...], entries: Sequence[FrameEntry]
 ) -> PlannedRecording:
     plan = RecordingPlan(
         name=recording.name,
@@ -217,59 +261,7 @@ def _plan(
         fingerprint=fingerprint(recording, entries),
         frame_indexes=tuple(entry.index for entry in entries),
     )
-    return store.plan_recording(store.ensure_map(map_name), plan, describer.models)
-
-
-def _read_ahead(
-    recording: Recording, entries: Sequence[FrameEntry]
-) -> Iterator[tuple[FrameEntry, Frame | FrameError, float]]:
-    """Frames in order, the next one decoding in a thread while this one is described."""
-
-    def read(entry: FrameEntry) -> tuple[FrameEntry, Frame | FrameError, float]:
-        started = time.perf_counter()
-        try:
-            result: Frame | FrameError = recording.read(entry)
-        except FrameError as error:
-            result = error
-        return entry, result, time.perf_counter() - started
-
-    with ThreadPoolExecutor(1, thread_name_prefix="semdb-read") as pool:
-        following = [pool.submit(read, entry) for entry in entries[:2]]
-        for position in range(len(entries)):
-            current = following.pop(0).result()
-            if position + 2 < len(entries):
-                following.append(pool.submit(read, entries[position + 2]))
-            yield current
-
-
-def _describe_and_store(summary: IngestSummary, store: Store, describer: Describer, frame: Frame) -> None:
-    if frame.world_from_camera is None:
-        raise UsageError(f"{frame.name} has no pose, so it cannot be a keyframe")
-    description = describer.describe(frame.image, frame.depth, frame.camera, frame.instances)
-    for stage, milliseconds in description.timing_ms.items():
-        summary.seconds[stage] += milliseconds / 1000
-    started = time.perf_counter()
-    record = KeyframeRecord(
-        frame_index=frame.index,
-        timestamp_ns=frame.timestamp_ns,
-        camera=frame.camera,
-        world_from_camera=frame.world_from_camera,
-        image_bytes=frame.image_bytes,
-        depth_bytes=frame.depth_bytes,
-        depth_scale=frame.depth_scale,
-        depth_registration=frame.depth_registration,
-        description=description,
-    )
-    result = store.write_keyframe(summary.recording_id, record)
-    summary.seconds["store"] += time.perf_counter() - started
-    summary.stored += int(result.created)
-    summary.objects += len(description.detections)
-    summary.keypoints += len(description.keypoints)
-
-
-def _fail(summary: IngestSummary, store: Store, entry: FrameEntry, error: FrameError) -> None:
-    summary.failed[entry.index] = str(error)
-    store.fail_item(summary.recording_id, entry.index, str(error))
+    return store.plan_recording(store.ensure_map(map_name), plan, models)
 
 
 def _check_names(recordings: Sequence[Recording]) -> None:

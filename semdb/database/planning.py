@@ -154,11 +154,12 @@ def _resume(connection: Connection, row: Row[Any], plan: RecordingPlan, map_name
     name = f"the recording {plan.name!r} of the map {map_name!r}"
     if row.state == RecordingState.DELETING:
         raise UsageError(f"{name} is being deleted: let `semdb delete` finish")
-    for what, old, new in (
-        ("format", row.format, plan.format),
-        ("number of frames", row.frame_count, plan.frame_count),
+    # It may have grown: the same keyframes are still those that were planned.
+    for what, old, new, same in (
+        ("format", row.format, plan.format, row.format == plan.format),
+        ("number of frames", row.frame_count, plan.frame_count, row.frame_count <= plan.frame_count),
     ):
-        if old != new:
+        if not same:
             raise UsageError(f"{name} is stored already and is another one: its {what} is {old}, not {new}; {advice}")
     if row.fingerprint != plan.fingerprint:
         raise UsageError(

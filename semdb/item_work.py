@@ -1,0 +1,183 @@
+"""Working off the keyframes of a planned recording: what `semdb ingest` and every worker of a fleet do.
+
+Keyframes are claimed in the database a few at a time, decoded, described and stored in stages that overlap, each
+stored in one transaction that checks the claim. See `semdb.database.items` for what a claim is.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from queue import SimpleQueue
+
+from semdb.database import items
+from semdb.database.items import Claim
+from semdb.database.records import KeyframeRecord
+from semdb.database.store import Store
+from semdb.errors import DatabaseError, FrameError, LeaseLostError, RecordingUnavailableError, UsageError
+from semdb.perception.describe import Describer
+from semdb.pipeline import Stage, overlapped
+from semdb.recordings.base import FrameEntry, Recording
+from semdb.types import Description, Frame
+
+STAGES = ("read", "detect", "encode", "features", "store")
+
+
+@dataclass(slots=True)
+class Item:
+    """One keyframe on its way. In the end it is stored, has an `error`, or is `lost` to another worker."""
+
+    claim: Claim
+    entry: FrameEntry | None  # None: the recording has no such frame any more
+    frame: Frame | None = None
+    description: Description | None = None
+    error: str | None = None
+    lost: bool = False
+    created: bool = False
+    objects: int = 0
+    keypoints: int = 0
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+def work_off(
+    recording: Recording,
+    recording_id: int,
+    store: Store,
+    describers: Sequence[Describer],
+    *,
+    frames: Sequence[int] | None = None,
+    stop: Callable[[], bool] = lambda: False,
+    lease_s: int = items.LEASE_S,
+) -> Iterator[Item]:
+    """Claims keyframes of `recording`, of `frames` where given, and stores them; yields each when it is done.
+
+    Ends when none is left that nobody else works on, or soon after `stop` says so: what is under way is finished,
+    what is not begun is given back. Each of `describers` works in a thread of its own. A frame that cannot be read or
+    described is `failed`, and the rest goes on. Raises RecordingUnavailableError when the recording's folder is gone,
+    NotFoundError when the recording is deleted, ProvenanceError, ModelError, DatabaseError.
+    """
+    worker = items.worker_name()
+    batch = 2 * len(describers) + 1
+    idle: SimpleQueue[Describer] = SimpleQueue()
+    for describer in describers:
+        idle.put(describer)
+    stages = (
+        Stage("read", lambda item: _read(recording, item)),
+        Stage("describe", lambda item: _describe(idle, item), len(describers)),
+        Stage("store", lambda item: _store(store, recording_id, item)),
+    )
+    claimed = _claims(recording, recording_id, store, worker, batch, frames, stop, lease_s)
+    with _Renewal(store, recording_id, worker, lease_s):
+        try:
+            yield from overlapped(claimed, stages, window=batch + 2)
+        finally:
+            items.release(store.engine, recording_id, worker)
+
+
+def _claims(
+    recording: Recording,
+    recording_id: int,
+    store: Store,
+    worker: str,
+    batch: int,
+    frames: Sequence[int] | None,
+    stop: Callable[[], bool],
+    lease_s: int,
+) -> Iterator[Item]:
+    entries = {entry.index: entry for entry in recording.entries}
+    items.release_dead(store.engine, recording_id)
+    while not stop():
+        claims = items.claim(store.engine, recording_id, worker, limit=batch, frames=frames, lease_s=lease_s)
+        if not claims:
+            return
+        for claim in claims:
+            if stop():
+                return
+            yield Item(claim, entries.get(claim.frame_index))
+
+
+class _Renewal:
+    """A thread that renews the leases of a worker while it lives."""
+
+    def __init__(self, store: Store, recording_id: int, worker: str, lease_s: int) -> None:
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._run, args=(store, recording_id, worker, lease_s), daemon=True)
+
+    def __enter__(self) -> None:
+        self._thread.start()
+
+    def __exit__(self, *_: object) -> None:
+        self._end.set()
+        self._thread.join()
+
+    def _run(self, store: Store, recording_id: int, worker: str, lease_s: int) -> None:
+        while not self._end.wait(lease_s / 3):
+            try:
+                items.renew(store.engine, recording_id, worker, lease_s)
+            except DatabaseError:
+                continue  # where leases run out meanwhile, the writing transactions notice
+
+
+def _read(recording: Recording, item: Item) -> Item:
+    started = time.perf_counter()
+    if item.entry is None:
+        item.error = f"{recording.path}: has no usable frame {item.claim.frame_index} any more"
+        return item
+    try:
+        item.frame = recording.read(item.entry)
+    except FrameError as error:
+        if not recording.path.is_dir():
+            raise RecordingUnavailableError(
+                f"{recording.path}: the folder is not there any more; when it is mounted again, run the same again"
+            ) from error
+        item.error = str(error)
+    item.seconds["read"] = time.perf_counter() - started
+    return item
+
+
+def _describe(idle: SimpleQueue[Describer], item: Item) -> Item:
+    frame = item.frame
+    if frame is None:
+        return item
+    if frame.world_from_camera is None:
+        raise UsageError(f"{frame.name} has no pose, so it cannot be a keyframe")
+    describer = idle.get()
+    try:
+        item.description = describer.describe(frame.image, frame.depth, frame.camera, frame.instances)
+    except FrameError as error:
+        item.error = f"{frame.name}: {error}"
+        return item
+    finally:
+        idle.put(describer)
+    for stage, milliseconds in item.description.timing_ms.items():
+        item.seconds[stage] = milliseconds / 1000
+    return item
+
+
+def _store(store: Store, recording_id: int, item: Item) -> Item:
+    started = time.perf_counter()
+    frame, description = item.frame, item.description
+    item.frame = item.description = None  # so that what waits to be taken note of holds no images
+    if frame is None or description is None or frame.world_from_camera is None:
+        item.lost = not items.fail(store.engine, recording_id, item.claim, item.error or "")
+        return item
+    record = KeyframeRecord(
+        frame_index=frame.index,
+        timestamp_ns=frame.timestamp_ns,
+        camera=frame.camera,
+        world_from_camera=frame.world_from_camera,
+        image_bytes=frame.image_bytes,
+        depth_bytes=frame.depth_bytes,
+        depth_scale=frame.depth_scale,
+        depth_registration=frame.depth_registration,
+        description=description,
+    )
+    try:
+        item.created = store.write_keyframe(recording_id, record, item.claim).created
+    except LeaseLostError:
+        item.lost = True
+    item.objects, item.keypoints = len(description.detections), len(description.keypoints)
+    item.seconds["store"] = time.perf_counter() - started
+    return item
