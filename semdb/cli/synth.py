@@ -24,6 +24,7 @@ def command(
         bool, typer.Option("--second-visit", help="Another walk through the same room, some objects moved.")
     ] = False,
     lap_frames: Annotated[int, typer.Option(help="Frames in which the camera turns once around.")] = 120,
+    person: Annotated[bool, typer.Option("--person", help="Somebody walks to and fro before the camera.")] = False,
 ) -> None:
     """Render a furnished room as a recording.
 
@@ -43,6 +44,7 @@ def command(
         lighting=lighting,
         second_visit=second_visit,
         lap_frames=lap_frames,
+        person=person,
     )
     with Progress("rendering") as progress:
         write_synthetic_recording(directory, options, progress.update)

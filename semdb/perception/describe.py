@@ -73,11 +73,11 @@ class Describer:
         does not bring.
         """
         _check_sizes(image, depth, camera)
-        detections, detect_ms = _timed(lambda: self.rules.apply(self.detector.detect(image, instances), depth))
+        detections, detect_ms = _timed(lambda: self.rules.apply(self.detector.detect(image, instances)))
         vector, encode_ms = _timed(lambda: self.encoder.encode(image))
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         found, extract_ms = _timed(lambda: self.features.extract(grey, self.rules.still(detections)))
-        (keypoints, geometry), lift_ms = _timed(lambda: _join(camera, depth, detections, found))
+        (keypoints, geometry), lift_ms = _timed(lambda: _join(camera, depth, detections, found, self.rules.depth_gap))
         return Description(
             camera=camera,
             detections=detections,
@@ -104,11 +104,15 @@ def describer_from_specs(detector: str, encoder: str, features: str, settings: S
 
 
 def _join(
-    camera: Camera, depth: Float32Array | None, detections: tuple[Detection, ...], features: Features
+    camera: Camera,
+    depth: Float32Array | None,
+    detections: tuple[Detection, ...],
+    features: Features,
+    depth_gap: float,
 ) -> tuple[Keypoints, tuple[ObjectGeometry, ...]]:
     owner = assign_to_objects(features.xy, [detection.mask for detection in detections])
     ordered, object_index = sort_by_object(features, owner)
-    geometry = tuple(object_geometry(camera, depth, detection) for detection in detections)
+    geometry = tuple(object_geometry(camera, depth, detection, depth_gap) for detection in detections)
     return Keypoints(ordered, object_index, lift(camera, depth, ordered.xy)), geometry
 
 

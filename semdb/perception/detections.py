@@ -11,14 +11,13 @@ from dataclasses import asdict, dataclass, field, replace
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from semdb.errors import UsageError
 from semdb.perception.detectors.coco import INDOOR, NO_OBJECT
 from semdb.perception.model_files import canonical_json
 from semdb.perception.protocols import Detector
 from semdb.settings import Settings
-from semdb.types import BoolArray, Detection, Float32Array, ModelInfo
+from semdb.types import BoolArray, Detection, ModelInfo
 
 _MARGIN, _MARGIN_MIN = 0.01, 3  # around a dynamic object, of the image's longer side and in pixels: masks are not exact
 
@@ -28,17 +27,17 @@ class MaskRules:
     """How masks are cleaned and duplicates found; docs/models.md has what each does to two recordings.
 
     `part_share`: connected parts of a mask smaller than this share of the largest are dropped (a table behind the
-    leg of a chair keeps both halves). `min_pixels`: so is a mask smaller than this. `depth_gap`: with depth, pixels
-    whose distance differs by more than this share from all of the mask's largest part without a jump of depth are
-    dropped (0: depth is not used). `duplicate_iou`: of two masks that overlap by this much the one with the lower
-    score is dropped when it has the same class, or less than `rival_share` of the other's score: two classes with
-    nearly the same score both stay, because from elsewhere the other one would win. `contained`: a mask with this
-    share inside one of its own class with a higher score is dropped.
+    leg of a chair keeps both halves). `min_pixels`: so is a mask smaller than this. `depth_gap`: where an object is and
+    how large comes from the part of its mask that is at one depth (`semdb.perception.objects.at_one_depth`); its mask
+    stays, because a query often has no depth and must be described as the keyframes are. `duplicate_iou`: of two masks
+    that overlap by this much the one with the lower score is dropped when it has the same class, or less than
+    `rival_share` of the other's score: two classes with nearly the same score both stay, because from elsewhere the
+    other one would win. `contained`: a mask with this share inside one of its own class with a higher score is dropped.
     """
 
     part_share: float = 0.3
     min_pixels: int = 64
-    depth_gap: float = 0.2
+    depth_gap: float = 0.1
     duplicate_iou: float = 0.7
     rival_share: float = 0.8
     contained: float = 0.85
@@ -56,12 +55,12 @@ class DetectionRules:
     dynamic: tuple[str, ...] = ()
     masks: MaskRules | None = field(default_factory=MaskRules)
 
-    def apply(self, detections: Sequence[Detection], depth: Float32Array | None) -> tuple[Detection, ...]:
-        """The objects of a detector's `detections`, by descending score; `depth` ``[H, W]`` in metres, or None."""
+    def apply(self, detections: Sequence[Detection]) -> tuple[Detection, ...]:
+        """The objects of a detector's `detections`, by descending score."""
         kept = [d for d in detections if self.classes is None or d.category in (*self.classes, *self.dynamic)]
         if self.masks is None:
             return tuple(kept)
-        cleaned = [c for c in (clean_mask(d, depth, self.masks) for d in kept) if c is not None]
+        cleaned = [c for c in (clean_mask(d, self.masks) for d in kept) if c is not None]
         return without_duplicates(cleaned, self.masks)
 
     def still(self, detections: Sequence[Detection]) -> BoolArray | None:
@@ -75,6 +74,11 @@ class DetectionRules:
         free: BoolArray = cv2.dilate(covered, kernel) == 0
         return free
 
+    @property
+    def depth_gap(self) -> float:
+        """For `semdb.perception.objects.object_geometry`."""
+        return 0.0 if self.masks is None else self.masks.depth_gap
+
     def info(self, detector: ModelInfo) -> ModelInfo:
         """Provenance of `detector` with these rules: other rules make rows that cannot be compared."""
         config = {**json.loads(detector.config), **(asdict(self.masks) if self.masks is not None else {})}
@@ -85,7 +89,7 @@ class DetectionRules:
         return replace(detector, config=canonical_json(config))
 
 
-def clean_mask(detection: Detection, depth: Float32Array | None, rules: MaskRules) -> Detection | None:
+def clean_mask(detection: Detection, rules: MaskRules) -> Detection | None:
     """`detection` with the main part of its mask and the box about that; None when too little is left.
 
     A box changes only where its mask lost parts.
@@ -94,8 +98,6 @@ def clean_mask(detection: Detection, depth: Float32Array | None, rules: MaskRule
     inside = np.ascontiguousarray(detection.mask[y : y + h, x : x + w])
     before = int(np.count_nonzero(inside))
     part = _main_parts(inside, rules.part_share)
-    if depth is not None and rules.depth_gap > 0:
-        part = _at_one_depth(part, depth[y : y + h, x : x + w], rules.depth_gap)
     area = int(np.count_nonzero(part))
     if area < rules.min_pixels:
         return None
@@ -146,37 +148,6 @@ def _main_parts(mask: BoolArray, share: float) -> BoolArray:
     keep = np.concatenate([[False], areas >= share * areas.max()])
     parts: BoolArray = keep[labels]
     return parts
-
-
-def _at_one_depth(mask: BoolArray, depth: Float32Array, gap: float) -> BoolArray:
-    """`mask` without pixels that are further than `gap` before or behind its largest part without a jump of depth.
-
-    Pixels without depth stay: nothing speaks against them; so does a mask with little depth as a whole.
-    """
-    with np.errstate(invalid="ignore"):
-        known = mask & np.isfinite(depth) & (depth > 0)
-    if np.count_nonzero(known) < 0.2 * np.count_nonzero(mask):
-        return mask
-    log = np.log(np.where(known, depth, 1.0)).astype(np.float32)
-    smooth = known & ~_jumps(log, known)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(smooth.view(np.uint8), connectivity=4)
-    if count < 2:
-        return mask
-    main = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
-    low, high = np.percentile(log[labels == main], [2, 98])
-    far = known & ((log < low - gap) | (log > high + gap))
-    result: BoolArray = mask & ~far
-    return result
-
-
-def _jumps(log: Float32Array, known: BoolArray) -> npt.NDArray[np.bool_]:
-    """Pixels whose right or lower neighbour is nearer or farther by more than 5 percent."""
-    jumps = np.zeros(known.shape, dtype=np.bool_)
-    across = known[:, 1:] & known[:, :-1] & (np.abs(np.diff(log, axis=1)) > 0.05)
-    down = known[1:] & known[:-1] & (np.abs(np.diff(log, axis=0)) > 0.05)
-    jumps[:, :-1] |= across
-    jumps[:-1] |= down
-    return jumps
 
 
 def rules_of(settings: Settings, detector: Detector) -> DetectionRules:

@@ -53,11 +53,14 @@ def take_features(features: Features, rows: npt.NDArray[np.intp]) -> Features:
     )
 
 
-def object_geometry(camera: Camera, depth: Float32Array | None, detection: Detection) -> ObjectGeometry:
+def object_geometry(
+    camera: Camera, depth: Float32Array | None, detection: Detection, depth_gap: float = 0.0
+) -> ObjectGeometry:
     """Where the object of `detection` is, from `depth` ``[H, W]`` metres under its mask less the mask's rim.
 
     The centroid is the median of the points and the extent goes from their 5th to their 95th percentile, so a
-    mask that takes in some background does little harm. NaN with fewer than 10 points with depth.
+    mask that takes in some background does little harm; with a `depth_gap` the background goes first
+    (`at_one_depth`). NaN with fewer than 10 points with depth.
     """
     area = int(np.count_nonzero(detection.mask))
     nowhere = ObjectGeometry(area, np.full(3, np.nan), np.full(3, np.nan))
@@ -66,6 +69,8 @@ def object_geometry(camera: Camera, depth: Float32Array | None, detection: Detec
     x, y, w, h = cv2.boundingRect(detection.mask.view(np.uint8))
     part = depth[y : y + h, x : x + w]
     inside = np.ascontiguousarray(detection.mask[y : y + h, x : x + w])
+    if depth_gap > 0:
+        inside = np.ascontiguousarray(at_one_depth(inside, part, depth_gap))
     kernel = np.ones((2 * _BORDER + 1, 2 * _BORDER + 1), dtype=np.uint8)
     eroded = cv2.erode(inside.view(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0).view(np.bool_)
     with np.errstate(invalid="ignore"):
@@ -85,3 +90,35 @@ def object_geometry(camera: Camera, depth: Float32Array | None, detection: Detec
         return nowhere
     low, middle, high = np.percentile(points, [5, 50, 95], axis=0)
     return ObjectGeometry(area, middle, high - low)
+
+
+def at_one_depth(mask: BoolArray, depth: Float32Array, gap: float) -> BoolArray:
+    """`mask` ``[H, W]`` without pixels much before or behind its largest part without a jump of `depth` (metres).
+
+    Much is the share `gap`. Pixels without depth stay: nothing speaks against them; so does a mask with little depth
+    as a whole.
+    """
+    with np.errstate(invalid="ignore"):
+        known = mask & np.isfinite(depth) & (depth > 0)
+    if np.count_nonzero(known) < 0.2 * np.count_nonzero(mask):
+        return mask
+    log = np.log(np.where(known, depth, 1.0)).astype(np.float32)
+    smooth = known & ~_jumps(log, known)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(smooth.view(np.uint8), connectivity=4)
+    if count < 2:
+        return mask
+    main = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
+    low, high = np.percentile(log[labels == main], [2, 98])
+    far = known & ((log < low - gap) | (log > high + gap))
+    result: BoolArray = mask & ~far
+    return result
+
+
+def _jumps(log: Float32Array, known: BoolArray) -> npt.NDArray[np.bool_]:
+    """Pixels whose right or lower neighbour is nearer or farther by more than 5 percent."""
+    jumps = np.zeros(known.shape, dtype=np.bool_)
+    across = known[:, 1:] & known[:, :-1] & (np.abs(np.diff(log, axis=1)) > 0.05)
+    down = known[1:] & known[:-1] & (np.abs(np.diff(log, axis=0)) > 0.05)
+    jumps[:, :-1] |= across
+    jumps[:-1] |= down
+    return jumps

@@ -15,6 +15,7 @@ from semdb.perception.detectors.coco import COCO_91, INDOOR
 from semdb.perception.detectors.recorded import RecordedDetector
 from semdb.perception.encoders import load_encoder
 from semdb.perception.features import load_features
+from semdb.perception.objects import at_one_depth, object_geometry
 from semdb.settings import Settings
 from semdb.types import Camera, Detection, Features, ImageArray, InstanceMasks, ModelInfo
 
@@ -50,35 +51,35 @@ class Fake:
 
 def test_of_two_of_one_class_the_better_stays() -> None:
     a, b = thing(rectangle(10, 10, 60, 60), score=0.7), thing(rectangle(12, 12, 60, 60), score=0.9)
-    found = DetectionRules().apply((a, b), None)
+    found = DetectionRules().apply((a, b))
     assert found == (b,)
 
 
 def test_a_bench_over_a_chair_is_one_thing() -> None:
     chair, bench = thing(rectangle(10, 10, 60, 60), "chair", 0.95), thing(rectangle(10, 12, 60, 60), "bench", 0.6)
-    assert names(DetectionRules().apply((bench, chair), None)) == [("chair", 0.95)]
+    assert names(DetectionRules().apply((bench, chair))) == [("chair", 0.95)]
 
 
 def test_two_classes_that_are_nearly_as_sure_both_stay() -> None:
     laptop, tv = thing(rectangle(10, 10, 60, 60), "laptop", 0.8), thing(rectangle(10, 12, 60, 60), "tv", 0.7)
-    assert names(DetectionRules().apply((laptop, tv), None)) == [("laptop", 0.8), ("tv", 0.7)]
+    assert names(DetectionRules().apply((laptop, tv))) == [("laptop", 0.8), ("tv", 0.7)]
 
 
 def test_a_part_of_the_same_class_is_no_thing_but_a_cup_on_a_table_is() -> None:
     table = thing(rectangle(10, 10, 100, 100), "dining table", 0.9)
     leg = thing(rectangle(20, 20, 20, 60), "dining table", 0.6)
     cup = thing(rectangle(50, 50, 20, 20), "cup", 0.6)
-    assert names(DetectionRules().apply((table, leg, cup), None)) == [("dining table", 0.9), ("cup", 0.6)]
+    assert names(DetectionRules().apply((table, leg, cup))) == [("dining table", 0.9), ("cup", 0.6)]
 
 
 def test_neighbours_that_overlap_a_little_are_two() -> None:
     a, b = thing(rectangle(10, 10, 60, 60), score=0.9), thing(rectangle(40, 10, 60, 60), score=0.8)
-    assert len(DetectionRules().apply((a, b), None)) == 2
+    assert len(DetectionRules().apply((a, b))) == 2
 
 
 def test_specks_go_and_the_box_follows_the_mask() -> None:
     mask = rectangle(20, 20, 40, 40) | rectangle(100, 100, 5, 5)
-    (found,) = DetectionRules().apply((thing(mask, score=0.75),), None)
+    (found,) = DetectionRules().apply((thing(mask, score=0.75),))
     np.testing.assert_array_equal(found.mask, rectangle(20, 20, 40, 40))
     np.testing.assert_array_equal(found.box, [20, 20, 59, 59])
     assert found.score == 0.75
@@ -87,39 +88,49 @@ def test_specks_go_and_the_box_follows_the_mask() -> None:
 def test_a_table_behind_the_leg_of_a_chair_keeps_both_halves() -> None:
     mask = rectangle(20, 20, 40, 40) | rectangle(64, 20, 20, 40)
     detection = thing(mask)
-    (found,) = DetectionRules().apply((detection,), None)
+    (found,) = DetectionRules().apply((detection,))
     assert found is detection  # nothing changed, nor did the box
 
 
 def test_what_is_smaller_than_the_limit_is_no_object() -> None:
-    assert DetectionRules().apply((thing(rectangle(5, 5, 8, 7)),), None) == ()
-    assert len(DetectionRules().apply((thing(rectangle(5, 5, 8, 8)),), None)) == 1
+    assert DetectionRules().apply((thing(rectangle(5, 5, 8, 7)),)) == ()
+    assert len(DetectionRules().apply((thing(rectangle(5, 5, 8, 8)),))) == 1
 
 
-def test_the_wall_beside_a_chair_is_no_chair() -> None:
+def test_the_wall_beside_a_chair_does_not_say_where_the_chair_is() -> None:
     depth = np.full((HEIGHT, WIDTH), 4.0, dtype=np.float32)
     depth[20:80, 20:60] = 2.0
     depth[30:34, 30:34] = np.nan  # pixels without depth stay
     mask = rectangle(20, 20, 52, 60)
-    (found,) = DetectionRules().apply((thing(mask),), depth)
-    np.testing.assert_array_equal(found.mask, rectangle(20, 20, 40, 60))
-    (without,) = DetectionRules().apply((thing(mask),), None)
-    np.testing.assert_array_equal(without.mask, mask)
+    np.testing.assert_array_equal(at_one_depth(mask, depth, 0.1), rectangle(20, 20, 40, 60))
+    camera = Camera(WIDTH, HEIGHT, 130.0, 130.0, 79.5, 59.5)
+    clean = object_geometry(camera, depth, thing(mask), depth_gap=0.1)
+    exact = object_geometry(camera, depth, thing(rectangle(20, 20, 40, 60)))
+    sloppy = object_geometry(camera, depth, thing(mask))
+    assert clean.pixel_area == mask.sum()  # the mask stays
+    assert np.abs(clean.centroid - exact.centroid).max() < 0.03
+    assert clean.extent[2] == 0
+    assert sloppy.extent[2] == pytest.approx(2)
 
 
-def test_a_long_table_is_one_thing_at_many_depths() -> None:
+def test_a_long_table_is_at_one_depth() -> None:
     depth = np.broadcast_to(np.linspace(6, 1, HEIGHT, dtype=np.float32)[:, None], (HEIGHT, WIDTH)).copy()
-    table = thing(rectangle(20, 5, 100, 110), "dining table")
-    assert DetectionRules().apply((table,), depth) == (table,)
+    mask = rectangle(20, 5, 100, 110)
+    lost = mask & ~at_one_depth(mask, depth, 0.1)
+    assert lost.sum() == 0
+    half = depth.copy()
+    half[::2] = np.nan
+    half[:100] = np.nan
+    np.testing.assert_array_equal(at_one_depth(mask, half, 0.1), mask)  # too little depth to tell
 
 
 def test_only_the_classes_asked_for_and_the_dynamic_ones() -> None:
     things = [thing(rectangle(10, 10, 30, 30), "cup"), thing(rectangle(60, 10, 30, 30), "zebra")]
     things.append(thing(rectangle(60, 60, 30, 30), "person"))
     rules = rules_of(Settings(classes="indoor", dynamic="person"), Fake())
-    assert {d.category for d in rules.apply(things, None)} == {"cup", "person"}
+    assert {d.category for d in rules.apply(things)} == {"cup", "person"}
     assert rules.classes == INDOOR
-    assert {d.category for d in DetectionRules().apply(things, None)} == {"cup", "zebra", "person"}
+    assert {d.category for d in DetectionRules().apply(things)} == {"cup", "zebra", "person"}
 
 
 @pytest.mark.parametrize(
@@ -141,7 +152,7 @@ def test_rules_are_part_of_the_provenance_and_queries_adopt_them() -> None:
         "score_threshold": 0.5,
         "part_share": 0.3,
         "min_pixels": 64,
-        "depth_gap": 0.2,
+        "depth_gap": 0.1,
         "duplicate_iou": 0.7,
         "rival_share": 0.8,
         "contained": 0.85,
@@ -160,7 +171,7 @@ def test_rules_are_part_of_the_provenance_and_queries_adopt_them() -> None:
 def test_masks_of_a_recording_are_taken_as_they_are() -> None:
     rules = rules_of(Settings(), RecordedDetector())
     speck = thing(rectangle(20, 20, 40, 40) | rectangle(100, 100, 5, 5))
-    assert rules.apply((speck,), None) == (speck,)
+    assert rules.apply((speck,)) == (speck,)
     assert rules.info(RecordedDetector().info) == RecordedDetector().info
 
 
@@ -200,4 +211,4 @@ def test_no_feature_lies_on_a_dynamic_object_nor_does_it_count() -> None:
 
 
 def test_mask_rules_are_what_the_documentation_says() -> None:
-    assert MaskRules() == MaskRules(0.3, 64, 0.2, 0.7, 0.8, 0.85)
+    assert MaskRules() == MaskRules(0.3, 64, 0.1, 0.7, 0.8, 0.85)

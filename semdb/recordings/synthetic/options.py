@@ -20,6 +20,7 @@ class SyntheticOptions:
     change. `lap_frames` is the number of frames in which the camera turns once around itself.
     `blur` is the share of the time between two frames during which the shutter is open. `lighting` scales a change
     of gain, colour and direction of the light (1 is strong). `second_visit` walks another way, some objects moved.
+    With `person` somebody walks to and fro before the camera.
     Rooms to be confused with others: `furniture_seed` puts the furniture of another seed into the room, `alike` mirrors
     every texture (same shapes, same colours, another room), `desks` furnishes it with so many equal workplaces.
     """
@@ -37,6 +38,7 @@ class SyntheticOptions:
     furniture_seed: int | None = None
     alike: bool = False
     desks: int = 0
+    person: bool = False
 
     def __post_init__(self) -> None:
         """Raises UsageError naming the option that makes no sense."""

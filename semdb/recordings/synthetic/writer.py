@@ -21,6 +21,8 @@ from semdb.errors import UsageError
 from semdb.geometry import quat_wxyz_from_rotation
 from semdb.recordings.synthetic import sensor
 from semdb.recordings.synthetic.options import DEPTH_SCALE, FRAME_RATE_HZ, SyntheticOptions
+from semdb.recordings.synthetic.person import CATEGORY as PERSON
+from semdb.recordings.synthetic.person import walker_for
 from semdb.recordings.synthetic.render import Lamp, bake_light, render_view
 from semdb.recordings.synthetic.room import Room, build_room
 from semdb.recordings.synthetic.scene import PackedScene, mirrored, pack, yaw_pose
@@ -77,6 +79,7 @@ class SyntheticSequence:
         self.room, self._packed, self.moved = _scene(
             options.room_seed, options.furniture_seed, options.desks, options.alike, visit
         )
+        self._walker = walker_for(self.room, options.seed) if options.person else None
         # one more pose than frames: the blur of the last frame needs where the camera goes next
         poses = walk(self.room, options.frames + 1, options.lap_frames, options.seed, options.second_visit)
         self._poses = poses
@@ -85,7 +88,7 @@ class SyntheticSequence:
     @property
     def classes(self) -> dict[int, str]:
         """COCO-style class name of each label."""
-        return self.room.classes()
+        return self.room.classes() | ({} if self._walker is None else {self._walker.label: PERSON})
 
     def timestamp(self, index: int) -> float:
         """Seconds."""
@@ -95,6 +98,8 @@ class SyntheticSequence:
         """Frame `index` with all effects of the options."""
         options, pose = self.options, self._poses[index]
         view = render_view(self._packed, self.camera, pose)
+        if self._walker is not None:
+            view = self._walker.add_to(view, self.camera, pose, index)
         rgb, depth = view.rgb, view.depth
         if options.lighting > 0:
             rgb = sensor.change_light(rgb, depth, self.camera, pose, options.lighting, options.seed, index)
