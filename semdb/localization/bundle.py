@@ -1,9 +1,13 @@
 """Bundle adjustment of one query: equation (5) of the paper, with measured depth as a prior on the points.
 
-Unknown are the query's pose and every matched 3D point; the keyframes stay where they are. A point is held by
-its pixel in each keyframe that saw it and by the depth measured there, and pulls on the pose through its pixel
-(and depth, where the query has one) in the query. Levenberg-Marquardt on the Schur complement, analytic
-Jacobians, a Cauchy loss on each block of residuals.
+Unknown are the query's pose and every matched 3D point; the poses of the keyframes have a prior. A point is held by its
+pixel in each image that saw it and by the depth measured there. Every image has three unknowns more: how far the
+camera turned while it was read out. A rolling shutter reads the rows of an image one after the other, over up to the
+time of a frame, and a turning camera bends the image by many pixels, which a pose alone answers with a sideways
+step (Hedborg, Forssén, Felsberg, Ringaby: Rolling shutter bundle adjustment, CVPR 2012; here the rotation alone,
+which moves pixels most). The pose is that of the middle row.
+
+Levenberg-Marquardt on the Schur complement, analytic Jacobians, a Cauchy loss on each block of residuals.
 """
 
 from __future__ import annotations
@@ -16,123 +20,244 @@ from semdb.geometry import so3_exp
 from semdb.types import Float32Array, FloatArray, IntArray
 
 CAUCHY_SQUARED = 4.0  # (2 sigma)^2: where the loss leaves the parabola
+QUERY = 0  # index of the query among the images
+EVIDENCE_ROUNDS = 30
+FIXED = 1e-7  # a standard deviation (m, rad) that nothing moves
+
+
+@dataclass(frozen=True, slots=True)
+class MotionPrior:
+    """Standard deviations, the greatest that are believed: what the images show decides (see `adjust`).
+
+    `turn_rad`: rotation during the readout, 0.02 rad being 35 degrees a second over 33 ms. `keyframe_m` and
+    `keyframe_rad`: error of a keyframe's recorded pose. The least are what is left of them when nothing is seen.
+    """
+
+    turn_rad: float = 0.02
+    keyframe_m: float = 0.005
+    keyframe_rad: float = 0.005
+    least_turn_rad: float = 0.0003
+    least_keyframe_m: float = 0.0002
+    least_keyframe_rad: float = 0.0002
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BundleProblem:
-    """What was seen. Pixels are divided by the focal length: normalised, undistorted coordinates.
+    """What was seen, and the images: the query first, then the keyframes.
 
-    `keyframe_point` says of which point each keyframe observation is; `world_from_keyframe` its pose.
-    Sigmas are standard deviations in the same units as what they belong to.
+    Pixels are divided by the focal length: normalised, undistorted coordinates. Sigmas are standard deviations in the
+    same units. `rows` run from -0.5 (top of the image) to 0.5.
     """
 
     points: FloatArray  # [m, 3] world, first guess
-    query_xy: FloatArray  # [m, 2]
-    query_sigma: FloatArray  # [m]
-    query_depth: FloatArray  # [m] metres, NaN where there is none
-    keyframe_point: IntArray  # [k]
-    keyframe_xy: FloatArray  # [k, 2]
-    keyframe_sigma: FloatArray  # [k]
-    keyframe_depth: FloatArray  # [k] metres, NaN where there is none
-    keyframe_rotation: FloatArray  # [k, 3, 3] keyframe_from_world
-    keyframe_translation: FloatArray  # [k, 3]
+    observed_point: IntArray  # [k] ascending
+    observed_image: IntArray  # [k]
+    xy: FloatArray  # [k, 2]
+    sigma: FloatArray  # [k]
+    depth: FloatArray  # [k] metres, NaN where there is none
+    rows: FloatArray  # [k]
+    keyframe_from_world: FloatArray  # [c - 1, 4, 4]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BundleResult:
-    """`covariance` is of translation (m, world) and rotation (rad, left perturbation in the world)."""
+    """`covariance` is of translation (m, world) and rotation (rad, left perturbation in the world) of the query.
+
+    `image_from_world` and `turn` (rad, over the whole readout) are of the query first, then the keyframes.
+    """
 
     camera_from_world: FloatArray  # [4, 4]
     points: FloatArray  # [m, 3]
     covariance: FloatArray  # [6, 6]
-    query_chi2: FloatArray  # [m] squared pixel residual in the query over its variance
+    image_from_world: FloatArray  # [c, 4, 4]
+    turn: FloatArray  # [c, 3]
+    chi2: FloatArray  # [k] squared pixel residual over its variance
     iterations: int
 
 
 @dataclass(slots=True)
-class _Blocks:
-    """Normal equations: pose, points, and what couples them; `cost` is the robust cost."""
+class _State:
+    """Where the solution stands. `shift` is how far the images have moved from their start."""
 
-    pose: FloatArray  # [6, 6]
-    pose_gradient: FloatArray  # [6]
-    coupling: FloatArray  # [m, 6, 3]
+    poses: FloatArray  # [c, 4, 4]
+    turn: FloatArray  # [c, 3]
+    shift: FloatArray  # [c, 6]
+    points: FloatArray  # [m, 3]
+
+
+@dataclass(slots=True)
+class _Blocks:
+    """Normal equations: images, points, and what couples them; `cost` is the robust cost with the priors."""
+
+    images: FloatArray  # [c, 9, 9]
+    image_gradients: FloatArray  # [c, 9]
+    coupling: FloatArray  # [k, 9, 3]
     points: FloatArray  # [m, 3, 3]
-    points_gradient: FloatArray  # [m, 3]
-    query_chi2: FloatArray  # [m]
+    point_gradients: FloatArray  # [m, 3]
+    chi2: FloatArray  # [k]
     cost: float = 0.0
 
 
-def _linearise(problem: BundleProblem, pose: FloatArray, points: FloatArray) -> _Blocks:
-    from semdb.localization.bundle_kernels import normal_equations
+class _Solver:
+    """One problem with what does not change while it is solved."""
 
-    count = len(points)
-    blocks = _Blocks(
-        np.empty((6, 6)), np.empty(6), np.empty((count, 6, 3)), np.empty((count, 3, 3)), np.empty((count, 3)),
-        np.empty(count),
-    )  # fmt: skip
-    query = np.column_stack([problem.query_xy, problem.query_sigma, problem.query_depth])
-    keyframe = np.column_stack([problem.keyframe_xy, problem.keyframe_sigma, problem.keyframe_depth])
-    blocks.cost = normal_equations(
-        pose, points, query, problem.keyframe_point, keyframe, problem.keyframe_rotation, problem.keyframe_translation,
-        CAUCHY_SQUARED, blocks.pose, blocks.pose_gradient, blocks.coupling, blocks.points, blocks.points_gradient,
-        blocks.query_chi2,
-    )  # fmt: skip
-    return blocks
+    def __init__(self, problem: BundleProblem) -> None:
+        self.problem = problem
+        self.observed = np.column_stack([problem.xy, problem.sigma, problem.depth, problem.rows])
+        bounds = np.arange(len(problem.points) + 1)
+        self.first = np.searchsorted(problem.observed_point, bounds).astype(np.int32)
+        self.images = len(problem.keyframe_from_world) + 1
+        self.information = np.zeros((self.images, 9))  # of the priors
 
+    def linearise(self, state: _State) -> _Blocks:
+        from semdb.localization.bundle_kernels import normal_equations
 
-def _reduced(blocks: _Blocks, damping: float) -> tuple[FloatArray, FloatArray]:
-    """Equations ``[6, 6]`` and gradient ``[6]`` of the pose with the points eliminated."""
-    from semdb.localization.bundle_kernels import reduce_to_pose
+        m, c, k = len(state.points), self.images, len(self.observed)
+        blocks = _Blocks(
+            np.empty((c, 9, 9)), np.empty((c, 9)), np.empty((k, 9, 3)),
+            np.empty((m, 3, 3)), np.empty((m, 3)), np.empty(k),
+        )  # fmt: skip
+        poses = state.poses
+        blocks.cost = normal_equations(
+            state.points, np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), state.turn,
+            self.problem.observed_point, self.problem.observed_image, self.observed, CAUCHY_SQUARED,
+            blocks.images, blocks.image_gradients, blocks.coupling, blocks.points, blocks.point_gradients, blocks.chi2,
+        )  # fmt: skip
+        offset = np.concatenate([state.shift, state.turn], axis=1)
+        axis = np.arange(9)
+        blocks.images[:, axis, axis] += self.information
+        blocks.image_gradients += self.information * offset
+        blocks.cost += float((self.information * offset**2).sum())
+        return blocks
 
-    reduced, gradient = blocks.pose * (1 + damping * np.eye(6)), blocks.pose_gradient.copy()
-    reduce_to_pose(blocks.coupling, blocks.points, blocks.points_gradient, damping, reduced, gradient)
-    return reduced, gradient
+    def reduced(self, blocks: _Blocks, damping: float) -> tuple[FloatArray, FloatArray]:
+        """Equations ``[9c, 9c]`` and gradient ``[9c]`` of the images with the points eliminated."""
+        from semdb.localization.bundle_kernels import reduce_to_images
+
+        size = 9 * self.images
+        matrix = np.zeros((size, size))
+        for c in range(self.images):
+            own = slice(9 * c, 9 * c + 9)
+            matrix[own, own] = blocks.images[c]
+        matrix[np.arange(size), np.arange(size)] *= 1 + damping
+        gradient = blocks.image_gradients.reshape(-1).copy()
+        reduce_to_images(
+            blocks.coupling, blocks.points, blocks.point_gradients, self.first, self.problem.observed_image,
+            damping, matrix, gradient,
+        )  # fmt: skip
+        return matrix, gradient
+
+    def moved(self, state: _State, blocks: _Blocks, damping: float) -> tuple[_State, FloatArray]:
+        """The state after one step, and the step ``[c, 9]``."""
+        from semdb.localization.bundle_kernels import move_points
+
+        matrix, gradient = self.reduced(blocks, damping)
+        step = np.asarray(-np.linalg.solve(matrix, gradient), np.float64).reshape(-1, 9)
+        points = move_points(
+            state.points, blocks.coupling, blocks.points, blocks.point_gradients, self.first,
+            self.problem.observed_image, damping, step,
+        )  # fmt: skip
+        poses = np.stack([_move(pose, one) for pose, one in zip(state.poses, step, strict=True)])
+        return _State(poses, state.turn + step[:, 6:], state.shift + step[:, :6], points), step
+
+    def minimise(self, state: _State, max_iterations: int) -> tuple[_State, _Blocks, int]:
+        blocks, damping, iteration = self.linearise(state), 1e-4, 0
+        for iteration in range(1, max_iterations + 1):  # noqa: B007
+            proposed, step = self.moved(state, blocks, damping)
+            found = self.linearise(proposed)
+            if found.cost < blocks.cost:
+                gain = blocks.cost - found.cost
+                state, blocks = proposed, found
+                damping = max(damping / 10, 1e-9)
+                if gain < 1e-5 * blocks.cost or np.abs(step[QUERY]).max() < 1e-7:
+                    break
+            else:
+                damping *= 10
+                if damping > 1e6:
+                    break
+        return state, blocks, iteration
 
 
 def _move(pose: FloatArray, step: FloatArray) -> FloatArray:
-    rotation = so3_exp(step[3:])
+    rotation = so3_exp(step[3:6])
     moved = np.eye(4)
     moved[:3, :3] = rotation @ pose[:3, :3]
     moved[:3, 3] = rotation @ pose[:3, 3] + step[:3]
     return moved
 
 
-def adjust(problem: BundleProblem, camera_from_world: FloatArray, max_iterations: int = 15) -> BundleResult:
+def adjust(
+    problem: BundleProblem, camera_from_world: FloatArray, prior: MotionPrior | None = None, max_iterations: int = 15
+) -> BundleResult:
     """Minimises equation (5) from `camera_from_world` ``[4, 4]``.
 
+    It is solved twice. First the images may turn and the keyframes move as far as `prior` believes at most; then
+    the variance of each of these priors is what the solution shows it to be (MacKay's evidence approximation, Neural
+    Computation 4(3), 1992). So where nothing turned, no freedom is given that noise would use.
     Raises numpy.linalg.LinAlgError when the points do not determine the pose (fewer than three, or in a row).
     """
-    from semdb.localization.bundle_kernels import move_points
-
-    pose, points, damping = camera_from_world, problem.points, 1e-4
-    blocks = _linearise(problem, pose, points)
-    iteration = 0
-    for iteration in range(1, max_iterations + 1):  # noqa: B007
-        reduced, gradient = _reduced(blocks, damping)
-        pose_step = np.asarray(-np.linalg.solve(reduced, gradient), np.float64)
-        new_pose = _move(pose, pose_step)
-        new_points = move_points(points, blocks.coupling, blocks.points, blocks.points_gradient, damping, pose_step)
-        proposed = _linearise(problem, new_pose, new_points)
-        if proposed.cost < blocks.cost:
-            gain = blocks.cost - proposed.cost
-            pose, points, blocks = new_pose, new_points, proposed
-            damping = max(damping / 10, 1e-9)
-            if gain < 1e-5 * blocks.cost or np.abs(pose_step).max() < 1e-7:
-                break
-        else:
-            damping *= 10
-            if damping > 1e6:
-                break
-    return BundleResult(pose, points, _covariance(blocks, pose), blocks.query_chi2, iteration)
+    prior = prior or MotionPrior()
+    solver = _Solver(problem)
+    count = solver.images
+    poses = np.concatenate([camera_from_world[None], problem.keyframe_from_world])
+    state = _State(poses, np.zeros((count, 3)), np.zeros((count, 6)), problem.points)
+    greatest = np.array([prior.keyframe_m, prior.keyframe_rad, prior.turn_rad])
+    least = np.minimum(greatest, [prior.least_keyframe_m, prior.least_keyframe_rad, prior.least_turn_rad])
+    solver.information = _information(greatest, count)
+    state, blocks, iterations = solver.minimise(state, max_iterations)
+    solver.information = _information(_evident_sigma(solver, state, blocks, least, greatest), count)
+    state, blocks, more = solver.minimise(state, max_iterations)
+    covariance = _covariance(solver, blocks, state.poses[QUERY])
+    return BundleResult(
+        state.poses[QUERY], state.points, covariance, state.poses, state.turn, blocks.chi2, iterations + more
+    )
 
 
-def _covariance(blocks: _Blocks, camera_from_world: FloatArray) -> FloatArray:
-    """Covariance of the pose in the world, with the points marginalised out.
+def _information(sigma: FloatArray, images: int) -> FloatArray:
+    """Information ``[c, 9]`` of the priors. The query's pose has none."""
+    information = np.tile(np.repeat(1 / np.maximum(sigma, FIXED) ** 2, 3), (images, 1))
+    information[QUERY, :6] = 0.0
+    return information
+
+
+def _evident_sigma(
+    solver: _Solver, state: _State, blocks: _Blocks, least: FloatArray, greatest: FloatArray
+) -> FloatArray:
+    """Standard deviation ``[3]`` of the keyframes' shifts, of their rotations and of all turns, from a solution.
+
+    The sum of their squares over how many of them the images, not the priors, determine; iterated on the
+    equations of the solution, which are those of the priors `greatest`.
+    """
+    reduced, gradient = solver.reduced(blocks, 0.0)
+    offset = np.concatenate([state.shift, state.turn], axis=1).reshape(-1)
+    old = solver.information.reshape(-1)
+    data = reduced - np.diag(old)
+    pull = data @ offset - (gradient - old * offset)
+    kinds = np.tile(np.repeat(np.arange(3), 3), solver.images)
+    groups = [np.flatnonzero((kinds == kind) & (old > 0)) for kind in range(3)]
+    sigma = greatest
+    for _ in range(EVIDENCE_ROUNDS):
+        information = _information(sigma, solver.images).reshape(-1)
+        inverse = np.linalg.inv(data + np.diag(information))
+        mean, variance = inverse @ pull, np.diag(inverse)
+        found = np.empty(3)
+        for kind, members in enumerate(groups):
+            determined = float((1 - variance[members] * information[members]).sum())
+            found[kind] = np.sqrt((mean[members] ** 2).sum() / max(determined, 1e-6))
+        found = np.clip(found, least, greatest)
+        if np.abs(found - sigma).max() < 0.05 * float(np.abs(sigma).max()):
+            return found
+        sigma = found
+    return sigma
+
+
+def _covariance(solver: _Solver, blocks: _Blocks, camera_from_world: FloatArray) -> FloatArray:
+    """Covariance of the query's pose in the world, with all else marginalised out.
 
     A step (t, w) of the camera moves its centre by -R t and turns it by -R w, R being world_from_camera.
     """
-    reduced, _ = _reduced(blocks, 0.0)
-    in_camera = np.linalg.inv(reduced)
+    reduced, _ = solver.reduced(blocks, 0.0)
+    in_camera = np.linalg.inv(reduced)[:6, :6]
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = -camera_from_world[:3, :3].T
     covariance: FloatArray = turn @ in_camera @ turn.T

@@ -1,7 +1,8 @@
 """Normal equations of the bundle adjustment and their solution, compiled.
 
-Layouts: `pose` is ``camera_from_world`` ``[4, 4]``; an observation is (x, y) normalised, its sigma, and a depth in
-metres (NaN where there is none); a point's own blocks are 3x3, what couples it to the pose is 6x3.
+Layouts: an image has nine unknowns: translation, rotation (both a left perturbation of ``camera_from_world``) and its
+rotation while it was read out. An observation is (x, y) normalised, its sigma, a depth in metres (NaN where there is
+none) and the row it was seen in, -0.5 at the top of the image to 0.5 at the bottom. Observations are sorted by point.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ import numpy as np
 
 from semdb.compiled import kernel
 from semdb.types import FloatArray, IntArray
+
+PARAMETERS = 9  # of an image
 
 
 @kernel
@@ -51,71 +54,101 @@ def _observe(
 
 
 @kernel
+def _in_camera(
+    point: FloatArray, rotation: FloatArray, translation: FloatArray, turn: FloatArray, row: float, out: FloatArray
+) -> None:
+    """The point in the camera (out[0]) and as seen in `row` (out[1]): turned by ``turn * row``, to first order."""
+    for i in range(3):
+        out[0, i] = rotation[i, 0] * point[0] + rotation[i, 1] * point[1] + rotation[i, 2] * point[2] + translation[i]
+    x, y, z = out[0, 0], out[0, 1], out[0, 2]
+    out[1, 0] = x + row * (turn[1] * z - turn[2] * y)
+    out[1, 1] = y + row * (turn[2] * x - turn[0] * z)
+    out[1, 2] = z + row * (turn[0] * y - turn[1] * x)
+
+
+@kernel
 def normal_equations(
-    pose: FloatArray,
     points: FloatArray,
-    query: FloatArray,
-    keyframe_point: IntArray,
-    keyframe: FloatArray,
     rotation: FloatArray,
     translation: FloatArray,
+    turn: FloatArray,
+    observed_point: IntArray,
+    observed_image: IntArray,
+    observed: FloatArray,
     cauchy: float,
-    pose_block: FloatArray,
-    pose_gradient: FloatArray,
+    image_blocks: FloatArray,
+    image_gradients: FloatArray,
     coupling: FloatArray,
     point_blocks: FloatArray,
     point_gradients: FloatArray,
-    query_chi2: FloatArray,
+    chi2: FloatArray,
 ) -> float:
-    """Fills the blocks (all but the inputs before `cauchy`) and returns the robust cost.
+    """Fills the blocks (all after `cauchy`) and returns the robust cost.
 
-    `query` ``[m, 4]`` and `keyframe` ``[k, 4]`` are (x, y, sigma, depth); `rotation` ``[k, 3, 3]`` and `translation`
-    ``[k, 3]`` are keyframe_from_world of each observation.
+    `rotation` ``[c, 3, 3]``, `translation` ``[c, 3]``: camera_from_world; `turn` ``[c, 3]`` radians per readout;
+    `observed` ``[k, 5]`` is (x, y, sigma, depth, row). Filled: ``[c, 9, 9]``, ``[c, 9]``, ``[k, 9, 3]``, ``[m, 3, 3]``,
+    ``[m, 3]``, ``[k]``.
     """
-    pose_block[:] = 0.0
-    pose_gradient[:] = 0.0
+    image_blocks[:] = 0.0
+    image_gradients[:] = 0.0
     point_blocks[:] = 0.0
     point_gradients[:] = 0.0
     out = np.empty((5, 3))
+    local = np.empty((2, 3))
     by_point = np.empty((3, 3))
-    by_pose = np.empty((3, 6))
+    by_image = np.empty((3, PARAMETERS))
     cost = 0.0
-    for n in range(len(points)):
-        x = pose[0, 0] * points[n, 0] + pose[0, 1] * points[n, 1] + pose[0, 2] * points[n, 2] + pose[0, 3]
-        y = pose[1, 0] * points[n, 0] + pose[1, 1] * points[n, 1] + pose[1, 2] * points[n, 2] + pose[1, 3]
-        z = pose[2, 0] * points[n, 0] + pose[2, 1] * points[n, 1] + pose[2, 2] * points[n, 2] + pose[2, 3]
-        cost += _observe(x, y, z, query[n, 0], query[n, 1], query[n, 2], query[n, 3], cauchy, out)
-        query_chi2[n] = out[4, 0]
+    for k in range(len(observed)):
+        n, c = observed_point[k], observed_image[k]
+        row = observed[k, 4]
+        pose, w = rotation[c], turn[c]
+        _in_camera(points[n], pose, translation[c], w, row, local)
+        x, y, z = local[0, 0], local[0, 1], local[0, 2]
+        cost += _observe(
+            local[1, 0], local[1, 1], local[1, 2],
+            observed[k, 0], observed[k, 1], observed[k, 2], observed[k, 3], cauchy, out,
+        )  # fmt: skip
+        chi2[k] = out[4, 0]
         for r in range(3):
-            a, b, c = out[r + 1, 0], out[r + 1, 1], out[r + 1, 2]
-            by_pose[r, 0], by_pose[r, 1], by_pose[r, 2] = a, b, c
-            # the point turns with the camera by w x p, so row (a, b, c) becomes p x (a, b, c)
-            by_pose[r, 3], by_pose[r, 4], by_pose[r, 5] = y * c - z * b, z * a - x * c, x * b - y * a
+            p, q, s = out[r + 1, 0], out[r + 1, 1], out[r + 1, 2]
+            # through the turn of the readout, I + row [w]x, then through the pose
+            a = p + row * (q * w[2] - s * w[1])
+            b = q + row * (s * w[0] - p * w[2])
+            d = s + row * (p * w[1] - q * w[0])
+            by_image[r, 0], by_image[r, 1], by_image[r, 2] = a, b, d
+            # the point turns with the camera by w x p, so row (a, b, d) becomes p x (a, b, d)
+            by_image[r, 3], by_image[r, 4], by_image[r, 5] = y * d - z * b, z * a - x * d, x * b - y * a
+            by_image[r, 6], by_image[r, 7], by_image[r, 8] = (
+                row * (y * s - z * q), row * (z * p - x * s), row * (x * q - y * p),
+            )  # fmt: skip
             for j in range(3):
-                by_point[r, j] = a * pose[0, j] + b * pose[1, j] + c * pose[2, j]
-        for i in range(6):
-            pose_gradient[i] += by_pose[0, i] * out[0, 0] + by_pose[1, i] * out[0, 1] + by_pose[2, i] * out[0, 2]
-            for j in range(6):
-                pose_block[i, j] += (
-                    by_pose[0, i] * by_pose[0, j] + by_pose[1, i] * by_pose[1, j] + by_pose[2, i] * by_pose[2, j]
-                )
-            for j in range(3):
-                coupling[n, i, j] = (
-                    by_pose[0, i] * by_point[0, j] + by_pose[1, i] * by_point[1, j] + by_pose[2, i] * by_point[2, j]
-                )
+                by_point[r, j] = a * pose[0, j] + b * pose[1, j] + d * pose[2, j]
+        _add(by_image, by_point, out, image_blocks[c], image_gradients[c], coupling[k])
         _add_point(by_point, out, point_blocks[n], point_gradients[n])
-    for k in range(len(keyframe)):
-        n = keyframe_point[k]
-        turn = rotation[k]
-        x = turn[0, 0] * points[n, 0] + turn[0, 1] * points[n, 1] + turn[0, 2] * points[n, 2] + translation[k, 0]
-        y = turn[1, 0] * points[n, 0] + turn[1, 1] * points[n, 1] + turn[1, 2] * points[n, 2] + translation[k, 1]
-        z = turn[2, 0] * points[n, 0] + turn[2, 1] * points[n, 1] + turn[2, 2] * points[n, 2] + translation[k, 2]
-        cost += _observe(x, y, z, keyframe[k, 0], keyframe[k, 1], keyframe[k, 2], keyframe[k, 3], cauchy, out)
-        for r in range(3):
-            for j in range(3):
-                by_point[r, j] = out[r + 1, 0] * turn[0, j] + out[r + 1, 1] * turn[1, j] + out[r + 1, 2] * turn[2, j]
-        _add_point(by_point, out, point_blocks[n], point_gradients[n])
+    for c in range(len(image_blocks)):
+        for i in range(PARAMETERS):
+            for j in range(i):
+                image_blocks[c, i, j] = image_blocks[c, j, i]
     return cost
+
+
+@kernel
+def _add(
+    by_image: FloatArray,
+    by_point: FloatArray,
+    out: FloatArray,
+    block: FloatArray,
+    gradient: FloatArray,
+    coupling: FloatArray,
+) -> None:
+    """Adds one observation to its image (upper triangle of `block`), and fills what couples image and point."""
+    for i in range(PARAMETERS):
+        a, b, c = by_image[0, i], by_image[1, i], by_image[2, i]
+        gradient[i] += a * out[0, 0] + b * out[0, 1] + c * out[0, 2]
+        for j in range(i, PARAMETERS):
+            block[i, j] += a * by_image[0, j] + b * by_image[1, j] + c * by_image[2, j]
+        for j in range(3):
+            coupling[i, j] = a * by_point[0, j] + b * by_point[1, j] + c * by_point[2, j]
 
 
 @kernel
@@ -142,35 +175,41 @@ def invert_3x3(block: FloatArray, damping: float, inverse: FloatArray) -> None:
 
 
 @kernel
-def reduce_to_pose(
+def reduce_to_images(
     coupling: FloatArray,
     point_blocks: FloatArray,
     point_gradients: FloatArray,
+    first: IntArray,
+    observed_image: IntArray,
     damping: float,
     reduced: FloatArray,
     gradient: FloatArray,
 ) -> None:
-    """Subtracts from `reduced` ``[6, 6]`` and `gradient` ``[6]`` what the points account for (Schur complement)."""
+    """Subtracts from `reduced` ``[9c, 9c]`` and `gradient` ``[9c]`` what the points account for (Schur complement).
+
+    The observations of point n are ``first[n]`` to ``first[n + 1]``.
+    """
     inverse = np.empty((3, 3))
-    carried = np.empty((6, 3))
-    for n in range(len(coupling)):
+    carried = np.empty((PARAMETERS, 3))
+    for n in range(len(point_blocks)):
         invert_3x3(point_blocks[n], damping, inverse)
-        for i in range(6):
-            for j in range(3):
-                carried[i, j] = (
-                    coupling[n, i, 0] * inverse[0, j]
-                    + coupling[n, i, 1] * inverse[1, j]
-                    + coupling[n, i, 2] * inverse[2, j]
-                )
-            for j in range(3):
-                gradient[i] -= carried[i, j] * point_gradients[n, j]
-        for i in range(6):
-            for j in range(6):
-                reduced[i, j] -= (
-                    carried[i, 0] * coupling[n, j, 0]
-                    + carried[i, 1] * coupling[n, j, 1]
-                    + carried[i, 2] * coupling[n, j, 2]
-                )
+        for k in range(first[n], first[n + 1]):
+            one = PARAMETERS * observed_image[k]
+            for i in range(PARAMETERS):
+                a, b, c = coupling[k, i, 0], coupling[k, i, 1], coupling[k, i, 2]
+                total = 0.0
+                for j in range(3):
+                    carried[i, j] = a * inverse[0, j] + b * inverse[1, j] + c * inverse[2, j]
+                    total += carried[i, j] * point_gradients[n, j]
+                gradient[one + i] -= total
+            for other in range(first[n], first[n + 1]):
+                two = PARAMETERS * observed_image[other]
+                for i in range(PARAMETERS):
+                    a, b, c = carried[i, 0], carried[i, 1], carried[i, 2]
+                    for j in range(PARAMETERS):
+                        reduced[one + i, two + j] -= (
+                            a * coupling[other, j, 0] + b * coupling[other, j, 1] + c * coupling[other, j, 2]
+                        )
 
 
 @kernel
@@ -179,10 +218,12 @@ def move_points(
     coupling: FloatArray,
     point_blocks: FloatArray,
     point_gradients: FloatArray,
+    first: IntArray,
+    observed_image: IntArray,
     damping: float,
-    pose_step: FloatArray,
+    step: FloatArray,
 ) -> FloatArray:
-    """The points ``[m, 3]`` after the step that goes with `pose_step` ``[6]``."""
+    """The points ``[m, 3]`` after the step that goes with `step` ``[c, 9]`` of the images."""
     moved = points.copy()
     inverse = np.empty((3, 3))
     rest = np.empty(3)
@@ -190,8 +231,11 @@ def move_points(
         invert_3x3(point_blocks[n], damping, inverse)
         for j in range(3):
             rest[j] = point_gradients[n, j]
-            for i in range(6):
-                rest[j] += coupling[n, i, j] * pose_step[i]
+        for k in range(first[n], first[n + 1]):
+            c = observed_image[k]
+            for i in range(PARAMETERS):
+                for j in range(3):
+                    rest[j] += coupling[k, i, j] * step[c, i]
         for i in range(3):
             moved[n, i] -= inverse[i, 0] * rest[0] + inverse[i, 1] * rest[1] + inverse[i, 2] * rest[2]
     return moved

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import poselib
 
-from semdb.geometry import invert_pose, pose_error
-from semdb.localization.bundle import BundleProblem, BundleResult, adjust, pixel_sigma
+from semdb.geometry import invert_pose, pose_error, transform_points
+from semdb.localization.bundle import BundleProblem, BundleResult, MotionPrior, adjust, pixel_sigma
 from semdb.localization.matching import Matches, MatchingOptions, match_guided, match_keypoints
 from semdb.localization.views import KeyframeView, View
 from semdb.types import BoolArray, FloatArray, IntArray
@@ -28,6 +28,7 @@ class PoseOptions:
     guided: bool = True
     bundle: bool = True
     use_query_depth: bool = True
+    motion: MotionPrior = field(default_factory=MotionPrior)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -180,15 +181,16 @@ def estimate_pose(
         agreeing = reprojection_px(query, camera_from_world, pairs.query, points) < options.max_reprojection_px
         if agreeing.sum() < MINIMUM_PAIRS:
             return None
-    pairs, points = pairs.take(agreeing), points[agreeing]
-    covariance = None
-    if options.bundle:
-        try:
-            refined = bundle_adjust(query, keyframes, pairs, points, camera_from_world, options)
-        except np.linalg.LinAlgError:
-            return None
-        camera_from_world, covariance = refined.camera_from_world, refined.covariance
-    return _estimate(query, keyframes, pairs, points, camera_from_world, covariance, first, options)
+    if not options.bundle:
+        pairs, points = pairs.take(agreeing), points[agreeing]
+        error = reprojection_px(query, camera_from_world, pairs.query, points)
+        return _estimate(query, keyframes, pairs, error, camera_from_world, None, first, options)
+    try:
+        refined = bundle_adjust(query, keyframes, pairs.take(agreeing), points[agreeing], camera_from_world, options)
+    except np.linalg.LinAlgError:
+        return None
+    error = adjusted_error_px(query, keyframes, pairs, refined)
+    return _estimate(query, keyframes, pairs, error, refined.camera_from_world, refined.covariance, first, options)
 
 
 def _first_support(pairs: Pairs, agreeing: BoolArray) -> tuple[int, int, float]:
@@ -228,13 +230,12 @@ def _estimate(
     query: View,
     keyframes: Sequence[KeyframeView],
     pairs: Pairs,
-    points: FloatArray,
+    error: FloatArray,
     camera_from_world: FloatArray,
     covariance: FloatArray | None,
     first: tuple[int, int, float],
     options: PoseOptions,
 ) -> PoseEstimate | None:
-    error = reprojection_px(query, camera_from_world, pairs.query, points)
     keep = error < options.inlier_px
     if keep.sum() < MINIMUM_PAIRS or not np.isfinite(camera_from_world).all():
         return None
@@ -282,27 +283,53 @@ def bundle_adjust(
     rows, point_index = np.unique(pairs.query, return_inverse=True)
     counts = np.bincount(point_index).astype(np.float64)
     first_guess = np.stack([np.bincount(point_index, points[:, axis]) / counts for axis in range(3)], axis=1)
-    xy = np.empty((len(pairs), 2))
-    sigma, depth = np.empty(len(pairs)), np.empty(len(pairs))
-    rotation, translation = np.empty((len(pairs), 3, 3)), np.empty((len(pairs), 3))
+    seen = [_observations(query, rows, options, with_depth=options.use_query_depth)]
+    owner, image = [np.arange(len(rows))], [np.zeros(len(rows), np.int32)]
+    for slot, keyframe in enumerate(keyframes):
+        here = np.flatnonzero(pairs.slot == slot)
+        seen.append(_observations(keyframe.view, pairs.keypoint[here], options, with_depth=True))
+        owner.append(point_index[here])
+        image.append(np.full(len(here), slot + 1, np.int32))
+    observed, point = np.concatenate(seen), np.concatenate(owner).astype(np.int32)
+    order = np.argsort(point, kind="stable")
+    observed = observed[order]
+    problem = BundleProblem(
+        points=first_guess,
+        observed_point=point[order],
+        observed_image=np.concatenate(image)[order],
+        xy=observed[:, :2],
+        sigma=observed[:, 2],
+        depth=observed[:, 3],
+        rows=observed[:, 4],
+        keyframe_from_world=np.stack([keyframe.camera_from_world for keyframe in keyframes]),
+    )
+    return adjust(problem, camera_from_world, options.motion)
+
+
+def _observations(view: View, rows: IntArray, options: PoseOptions, *, with_depth: bool) -> FloatArray:
+    """(x, y, sigma, depth, row of the image) ``[n, 5]`` of keypoints `rows`."""
+    sigma = pixel_sigma(view.size[rows], view.focal, options.pixel_sigma_px)
+    depth = view.points[rows, 2].astype(np.float64) if with_depth else np.full(len(rows), np.nan)
+    return np.column_stack([view.xy[rows], sigma, depth, view.image_row[rows]])
+
+
+def adjusted_error_px(
+    query: View, keyframes: Sequence[KeyframeView], pairs: Pairs, adjusted: BundleResult
+) -> FloatArray:
+    """Distance ``[n]`` in pixels between the query's keypoints and the stored 3D points of `pairs`.
+
+    All images stand and turn as `adjusted` found; the points are those measured in the keyframes.
+    """
+    points = np.empty((len(pairs), 3))
     for slot, keyframe in enumerate(keyframes):
         here = pairs.slot == slot
         chosen = pairs.keypoint[here]
-        xy[here] = keyframe.view.xy[chosen]
-        sigma[here] = pixel_sigma(keyframe.view.size[chosen], keyframe.view.focal, options.pixel_sigma_px)
-        depth[here] = keyframe.view.points[chosen, 2]
-        rotation[here], translation[here] = keyframe.camera_from_world[:3, :3], keyframe.camera_from_world[:3, 3]
-    query_depth = query.points[rows, 2].astype(np.float64)
-    problem = BundleProblem(
-        points=first_guess,
-        query_xy=query.xy[rows],
-        query_sigma=pixel_sigma(query.size[rows], query.focal, options.pixel_sigma_px),
-        query_depth=query_depth if options.use_query_depth else np.full(len(rows), np.nan),
-        keyframe_point=point_index.astype(np.int32),
-        keyframe_xy=xy,
-        keyframe_sigma=sigma,
-        keyframe_depth=depth,
-        keyframe_rotation=rotation,
-        keyframe_translation=translation,
-    )
-    return adjust(problem, camera_from_world)
+        local = keyframe.view.points[chosen].astype(np.float64)
+        local -= np.cross(adjusted.turn[slot + 1] * keyframe.view.image_row[chosen, None], local)
+        points[here] = transform_points(invert_pose(adjusted.image_from_world[slot + 1]), local)
+    moved = transform_points(adjusted.camera_from_world, points)
+    moved += np.cross(adjusted.turn[0] * query.image_row[pairs.query, None], moved)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        offset = moved[:, :2] / moved[:, 2:] - query.xy[pairs.query]
+    distance = np.hypot(offset[:, 0], offset[:, 1]) * query.focal
+    return np.where(moved[:, 2] > 0.05, distance, np.inf)

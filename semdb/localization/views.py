@@ -37,6 +37,11 @@ class View:
     def focal(self) -> float:
         return (self.camera.fx + self.camera.fy) / 2
 
+    @property
+    def image_row(self) -> FloatArray:
+        """When each keypoint was read out ``[n]``: -0.5 in the top row of the image, 0.5 in the last."""
+        return (self.seen_xy[:, 1].astype(np.float64) + 0.5) / self.camera.height - 0.5
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyframeView:

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from semdb.geometry import invert_pose, pose_error, so3_exp
-from semdb.localization.bundle import BundleProblem, _linearise, _move, adjust
+from semdb.geometry import pose_error
 from semdb.localization.bundle_kernels import depth_sigma
 from semdb.localization.matching import Evidence, MatchingOptions
 from semdb.localization.pose import PoseOptions, estimate_pose, match_view, rival_pose
@@ -135,58 +134,6 @@ def test_objects_only_uses_no_background() -> None:
     assert estimate is not None
     assert (query.classes[estimate.pairs.query] >= 0).all()
     assert estimate.pairs.same_class.all()
-
-
-def _random_problem(seed: int) -> tuple[BundleProblem, np.ndarray]:
-    random = np.random.default_rng(seed)
-    points = random.uniform([-1, -1, 2], [1, 1, 4], (8, 3))
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = so3_exp(random.normal(size=3) * 0.1), random.normal(size=3) * 0.1
-    index = np.array([0, 1, 2, 3, 4, 5, 6, 7, 0, 3], np.int32)
-    local = points @ pose[:3, :3].T + pose[:3, 3]
-    problem = BundleProblem(
-        points=points + random.normal(size=points.shape) * 0.01,
-        query_xy=local[:, :2] / local[:, 2:] + random.normal(size=(8, 2)) * 0.001,
-        query_sigma=np.full(8, 1 / 500),
-        query_depth=np.where(np.arange(8) % 2 == 0, local[:, 2], np.nan),
-        keyframe_point=index,
-        keyframe_xy=points[index, :2] / points[index, 2:],
-        keyframe_sigma=np.full(10, 1 / 500),
-        keyframe_depth=points[index, 2],
-        keyframe_rotation=np.broadcast_to(np.eye(3), (10, 3, 3)).copy(),
-        keyframe_translation=np.zeros((10, 3)),
-    )
-    return problem, pose
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_gradient_is_that_of_the_cost(seed: int) -> None:
-    """Analytic gradient against central differences of the robust cost (the loss halves near the minimum)."""
-    problem, pose = _random_problem(seed)
-    blocks = _linearise(problem, pose, problem.points)
-    step = 1e-6
-    for axis in range(6):
-        move = np.zeros(6)
-        move[axis] = step
-        ahead = _linearise(problem, _move(pose, move), problem.points).cost
-        behind = _linearise(problem, _move(pose, -move), problem.points).cost
-        assert (ahead - behind) / (4 * step) == pytest.approx(blocks.pose_gradient[axis], rel=1e-3, abs=0.5)
-    moved = problem.points.copy()
-    moved[3, 2] += step
-    ahead = _linearise(problem, pose, moved).cost
-    moved[3, 2] -= 2 * step
-    behind = _linearise(problem, pose, moved).cost
-    assert (ahead - behind) / (4 * step) == pytest.approx(blocks.points_gradient[3, 2], rel=1e-3, abs=0.5)
-
-
-def test_adjustment_lowers_the_cost_and_reports_its_residuals() -> None:
-    problem, pose = _random_problem(1)
-    start = _linearise(problem, pose, problem.points).cost
-    result = adjust(problem, pose)
-    assert _linearise(problem, result.camera_from_world, result.points).cost < 0.5 * start
-    assert result.query_chi2.shape == (8,)
-    assert np.linalg.eigvalsh(result.covariance)[0] > 0
-    assert np.allclose(invert_pose(invert_pose(result.camera_from_world)), result.camera_from_world)
 
 
 def test_depth_noise_grows_with_the_square_of_depth() -> None:
