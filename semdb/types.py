@@ -89,6 +89,15 @@ class Detection:
     mask: BoolArray  # [H, W]
 
 
+@dataclass(frozen=True, slots=True)
+class WeakDetection:
+    """What a detector was not sure of, or saw beside another object: no object, but evidence of a class."""
+
+    category: str
+    score: float
+    height: float  # of the centre of its box, 0 at the top of the image, 1 at the bottom
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Features:
     """What a local feature finds in a grey image, before it is known on which object it lies."""
@@ -151,6 +160,7 @@ class Description:
     cnn_vector: Float32Array  # [d], L2-normalised
     models: tuple[ModelInfo, ...]  # detector, encoder, features
     timing_ms: Mapping[str, float] = field(default_factory=dict)  # detect, encode, features
+    weak: tuple[WeakDetection, ...] = ()  # beside the detections
     dynamic: frozenset[str] = frozenset()  # categories of objects that move: they say nothing about a place
 
     @property
@@ -160,6 +170,16 @@ class Description:
             if detection.category not in self.dynamic:
                 counts[detection.category] = counts.get(detection.category, 0) + 1
         return counts
+
+    @property
+    def evidence(self) -> list[tuple[str, float, float]]:
+        """Class, score and height in the image (0 top, 1 bottom) of all detections, weak ones too."""
+        strong = [
+            (d.category, d.score, (float(d.box[1]) + float(d.box[3]) + 1) / (2 * self.camera.height))
+            for d in self.detections
+        ]
+        weak = [(w.category, w.score, w.height) for w in self.weak]
+        return [item for item in (*strong, *weak) if item[0] not in self.dynamic]
 
 
 class Verdict(StrEnum):

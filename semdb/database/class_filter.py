@@ -5,12 +5,15 @@ The score is that of `semdb.class_score`. What is here is the reference that an 
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Collection, Mapping, Sequence
+from functools import reduce
+from typing import Any
 
-from sqlalchemy import Connection, Engine, Integer, Select, case, func, literal, select
+from sqlalchemy import BigInteger, Connection, Engine, Select, case, func, literal, select
 from sqlalchemy.sql.elements import ColumnElement
 
-from semdb.class_score import ClassQuery, ClassTerm, class_query
+from semdb.class_score import SCALE, ClassQuery, ClassTerm, Part, class_query
 from semdb.database import retry
 from semdb.database.records import ScoredKeyframe
 from semdb.database.tables import categories, keyframe_categories, keyframes, recordings
@@ -41,6 +44,7 @@ def _frequencies(connection: Connection, map_id: int, names: Collection[str]) ->
         .where(
             keyframe_categories.c.map_id == map_id,
             keyframe_categories.c.category_id == categories.c.id,
+            keyframe_categories.c.count > 0,
         )
         .scalar_subquery()
     )
@@ -70,14 +74,13 @@ def class_filter(
         known = _known(connection, query)
         if not known:
             return []
-        statement, overlap = _scores(map_id, known)
+        statement, points = _scores(map_id, query, known)
         statement = (
-            statement.having(overlap >= query.least(minimum_share))
-            .order_by(overlap.desc(), keyframe_categories.c.keyframe_id)
+            statement.having(points >= query.least(minimum_share))
+            .order_by(points.desc(), keyframe_categories.c.keyframe_id)
             .limit(at_most)
         )
-        # The quotient is taken here: servers divide integers each in their own way.
-        return [ScoredKeyframe(row[0], int(row[1]) / query.total) for row in connection.execute(statement)]
+        return [ScoredKeyframe(row[0], int(row[1]) / query.whole) for row in connection.execute(statement)]
 
     return retry.read(engine, work)
 
@@ -90,9 +93,10 @@ def class_scores(engine: Engine, map_id: int, query: ClassQuery, keyframe_ids: S
         known = _known(connection, query)
         found: dict[int, float] = {}
         for start in range(0, len(keys) if known else 0, CHUNK):
-            statement, _ = _scores(map_id, known)
+            statement, points = _scores(map_id, query, known)
             chunk = statement.where(keyframe_categories.c.keyframe_id.in_(keys[start : start + CHUNK]))
-            found.update((row[0], int(row[1]) / query.total) for row in connection.execute(chunk))
+            rows = connection.execute(chunk.having(points > 0))
+            found.update((row[0], int(row[1]) / query.whole) for row in rows)
         return found
 
     return retry.read(engine, work)
@@ -102,27 +106,46 @@ def _known(connection: Connection, query: ClassQuery) -> list[tuple[int, ClassTe
     """The terms of classes that the database knows, with the ids of these."""
     if not query.terms:
         return []
-    terms = {term.category: term for term in query.terms}
-    statement = select(categories.c.id, categories.c.name).where(categories.c.name.in_(list(terms)))
-    return sorted((int(key), terms[name]) for key, name in connection.execute(statement))
+    names = sorted({term.category for term in query.terms})
+    statement = select(categories.c.name, categories.c.id).where(categories.c.name.in_(names))
+    ids = {str(name): int(key) for name, key in connection.execute(statement)}
+    return sorted(
+        ((ids[term.category], term) for term in query.terms if term.category in ids), key=lambda pair: pair[0]
+    )
 
 
-def _scores(map_id: int, known: list[tuple[int, ClassTerm]]) -> tuple[Select[tuple[int, int]], ColumnElement[int]]:
-    """Keyframe and sum of its terms, grouped by keyframe; and the sum for conditions on it."""
+def _scores(
+    map_id: int, query: ClassQuery, known: list[tuple[int, ClassTerm]]
+) -> tuple[Select[Any], ColumnElement[int]]:
+    """Keyframe and points, grouped by keyframe; and the points for conditions on them.
+
+    A quotient is taken of what can be divided: servers round each in their own way.
+    """
     c = keyframe_categories.c
-    overlap = func.sum(_contribution(known))
-    ids = [category_id for category_id, _ in known]
-    query = select(c.keyframe_id, overlap).where(c.map_id == map_id, c.category_id.in_(ids)).group_by(c.keyframe_id)
-    return query, overlap
+    points: ColumnElement[int] = func.sum(_contribution(known))
+    if query.per_held:
+        whole = literal(query.total, BigInteger) + literal(query.per_held, BigInteger) * func.max(c.keyframe_strength)
+        scaled, union = points * literal(SCALE, BigInteger), whole - points
+        points = (scaled - scaled % union) // union
+    ids = sorted({category_id for category_id, _ in known})
+    statement = select(c.keyframe_id, points).where(c.map_id == map_id, c.category_id.in_(ids)).group_by(c.keyframe_id)
+    return statement, points
 
 
 def _contribution(known: list[tuple[int, ClassTerm]]) -> ColumnElement[int]:
-    """What one row (category, keyframe, count) adds: ``min(full, per_object * count)``."""
+    """What one row (category, keyframe) adds: the sum of ``min(full, per_object * value)`` of its parts."""
+    parts = {part: [pair for pair in known if pair[1].part is part] for part in Part}
+    branches = [_of_part(part, terms) for part, terms in parts.items() if terms]
+    return reduce(operator.add, branches)
+
+
+def _of_part(part: Part, known: list[tuple[int, ClassTerm]]) -> ColumnElement[int]:
     c = keyframe_categories.c
+    value = {Part.COUNT: c.count, Part.UPPER: c.upper_strength, Part.LOWER: c.lower_strength}[part]
     branches: list[tuple[ColumnElement[bool], ColumnElement[int]]] = []
     for category_id, term in known:
-        full, per_object = literal(term.full, Integer), literal(term.per_object, Integer)
+        full, per_object = literal(term.full, BigInteger), literal(term.per_object, BigInteger)
         enough = -(-term.full // term.per_object)
-        branches.append(((c.category_id == category_id) & (c.count >= enough), full))
-        branches.append((c.category_id == category_id, per_object * c.count))
-    return case(*branches, else_=literal(0, Integer))
+        branches.append(((c.category_id == category_id) & (value >= enough), full))
+        branches.append((c.category_id == category_id, per_object * value))
+    return case(*branches, else_=literal(0, BigInteger))

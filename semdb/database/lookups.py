@@ -72,6 +72,6 @@ def category_counts(engine: Engine, map_id: int) -> list[tuple[int, str, int]]:
     query = (
         select(table.keyframe_id, categories.c.name, table.count)
         .join(categories, categories.c.id == table.category_id)
-        .where(table.map_id == map_id)
+        .where(table.map_id == map_id, table.count > 0)
     )
     return retry.read(engine, lambda c: [(int(key), str(name), int(count)) for key, name, count in c.execute(query)])

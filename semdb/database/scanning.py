@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 from sqlalchemy import Connection, Engine, case, func, select
+from sqlalchemy.sql.elements import ColumnElement
 
+from semdb.class_score import MOST_OBJECTS, Part, word
 from semdb.database import retry
 from semdb.database.codecs import decode_vectors
 from semdb.database.reading import keyframe_ids
@@ -15,7 +19,7 @@ from semdb.database.tables import categories, cnn_vectors, keyframe_categories, 
 from semdb.types import Float32Array, Int64Array
 
 IN_CHUNK = 500
-FETCH = 20_000  # rows of two numbers at a time
+FETCH = 50_000  # numbers at a time
 DENSE = 0.5  # of the ids of a range that are wanted: from here on the range is read, not a list of ids
 
 
@@ -41,7 +45,7 @@ class CoarseRows:
 
     ids: Int64Array  # [n] ascending
     vectors: Float32Array  # [n, d]
-    objects: tuple[tuple[int, str, int], ...]  # keyframe, class, number of objects
+    words: tuple[tuple[int, str, int], ...]  # keyframe, word (`semdb.class_score.word`), number, none of them 0
 
 
 def coarse_rows(engine: Engine, ids: Int64Array) -> CoarseRows:
@@ -50,11 +54,14 @@ def coarse_rows(engine: Engine, ids: Int64Array) -> CoarseRows:
 
     def work(connection: Connection) -> tuple[list[tuple[int, bytes]], list[tuple[int, str, int]]]:
         c = keyframe_categories.c
-        query = select(c.keyframe_id, categories.c.name, c.count).join(categories, categories.c.id == c.category_id)
+        values = (c.count, c.upper_strength, c.lower_strength)
+        query = select(c.keyframe_id, categories.c.name, *values).join(categories, categories.c.id == c.category_id)
         shown = [
-            (int(row[0]), str(row[1]), int(row[2]))
+            (int(key), word(str(name), part), int(number))
             for keys in _in_chunks(wanted.tolist())
-            for row in connection.execute(query.where(c.keyframe_id.in_(keys)))
+            for key, name, *numbers in connection.execute(query.where(c.keyframe_id.in_(keys)))
+            for part, number in zip(Part, numbers, strict=True)
+            if number
         ]
         return _rows(connection, wanted), shown
 
@@ -72,18 +79,36 @@ def map_categories(engine: Engine, map_id: int) -> list[tuple[int, str]]:
     return retry.read(engine, lambda connection: [(int(key), str(name)) for key, name in connection.execute(query)])
 
 
-def category_column(engine: Engine, map_id: int, category_id: int) -> tuple[Int64Array, Int64Array]:
-    """Keyframes of a map that show a class ``[n]``, and how many objects of it each shows ``[n]``."""
+def category_columns(engine: Engine, map_id: int, category_id: int) -> tuple[Int64Array, dict[Part, Int64Array]]:
+    """Keyframes of a map that show a class ``[n]``, ascending, and how many objects, and how strongly, each ``[n]``.
+
+    More than `MOST_OBJECTS` count as so many. Read in several transactions.
+    """
     c = keyframe_categories.c
-    query = select(c.keyframe_id, c.count).where(c.map_id == map_id, c.category_id == category_id)
+    base = MOST_OBJECTS + 1
+    # One number per row: drivers in Python spend their time on values, not on bytes.
+    packed = c.keyframe_id * base + _at_most(c.count)
+    packed = (packed * base + _at_most(c.upper_strength)) * base + _at_most(c.lower_strength)
+    query = select(packed).where(c.map_id == map_id, c.category_id == category_id).order_by(c.keyframe_id).limit(FETCH)
+    pieces = [np.empty(0, np.int64)]
+    last = -1
+    while True:
+        chunk = query.where(c.keyframe_id > last)
+        numbers = retry.read(engine, lambda connection, chunk=chunk: list(connection.execute(chunk).scalars()))  # type: ignore[misc]
+        pieces.append(np.array(numbers, np.int64))
+        if len(numbers) < FETCH:
+            break
+        last = int(numbers[-1]) // base**3
+    joined = np.concatenate(pieces)
+    return joined // base**3, {
+        Part.COUNT: joined // base**2 % base,
+        Part.UPPER: joined // base % base,
+        Part.LOWER: joined % base,
+    }
 
-    def work(connection: Connection) -> Int64Array:
-        rows = connection.execute(query.execution_options(yield_per=FETCH))
-        pieces = [np.array([tuple(row) for row in piece], np.int64) for piece in rows.partitions()]
-        return np.concatenate([np.empty((0, 2), np.int64), *pieces])
 
-    table = retry.read(engine, work)
-    return table[:, 0], table[:, 1]
+def _at_most(column: ColumnElement[int]) -> ColumnElement[int]:
+    return case((column > MOST_OBJECTS, MOST_OBJECTS), else_=column)
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,21 +117,22 @@ class MapSums:
 
     keyframes: int
     sum_of_ids: int
-    category_rows: int
-    objects: int
+    words: int  # pairs of a keyframe and a word that it has
+    numbers: int  # the sum of their numbers
 
 
-def map_sums(engine: Engine, map_id: int, most_objects: int) -> MapSums:
-    """The sums over a map; more than `most_objects` of a class count as so many. Reads two indexes to the end."""
+def map_sums(engine: Engine, map_id: int) -> MapSums:
+    """The sums over a map; more than `MOST_OBJECTS` of a class count as so many. Reads two indexes to the end."""
     c = keyframe_categories.c
     frames = select(func.count(), func.coalesce(func.sum(keyframes.c.id), 0))
     frames = frames.select_from(keyframes.join(recordings)).where(recordings.c.map_id == map_id)
-    most = case((c.count > most_objects, most_objects), else_=c.count)
-    shown = select(func.count(), func.coalesce(func.sum(most), 0)).where(c.map_id == map_id)
+    values = (c.count, c.upper_strength, c.lower_strength)
+    there = reduce(operator.add, (case((value > 0, 1), else_=0) for value in values))
+    numbers = reduce(operator.add, (_at_most(value) for value in values))
+    shown = select(func.coalesce(func.sum(there), 0), func.coalesce(func.sum(numbers), 0)).where(c.map_id == map_id)
 
     def work(connection: Connection) -> MapSums:
-        numbers = [*connection.execute(frames).one(), *connection.execute(shown).one()]
-        return MapSums(*map(int, numbers))
+        return MapSums(*map(int, [*connection.execute(frames).one(), *connection.execute(shown).one()]))
 
     return retry.read(engine, work)
 

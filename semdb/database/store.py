@@ -7,7 +7,7 @@ from typing import Any
 
 from sqlalchemy import Connection, Engine, select
 
-from semdb.class_score import ClassQuery
+from semdb.class_score import ClassQuery, Part
 from semdb.database import (
     change_log,
     class_filter,
@@ -234,13 +234,13 @@ class Store:
         """Ids and names of the classes that keyframes of a map show."""
         return scanning.map_categories(self.engine, map_id)
 
-    def category_column(self, map_id: int, category_id: int) -> tuple[Int64Array, Int64Array]:
-        """Keyframes of a map that show a class, and how many objects of it each shows."""
-        return scanning.category_column(self.engine, map_id, category_id)
+    def category_columns(self, map_id: int, category_id: int) -> tuple[Int64Array, dict[Part, Int64Array]]:
+        """Keyframes of a map that show a class, ascending, and how many objects, and how strongly."""
+        return scanning.category_columns(self.engine, map_id, category_id)
 
-    def map_sums(self, map_id: int, most_objects: int) -> scanning.MapSums:
+    def map_sums(self, map_id: int) -> scanning.MapSums:
         """Sums over a map that a mirror of it must have too."""
-        return scanning.map_sums(self.engine, map_id, most_objects)
+        return scanning.map_sums(self.engine, map_id)
 
     def map_identity(self, map_id: int) -> str:
         """A map's name and when it was made; empty where there is none."""

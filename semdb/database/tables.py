@@ -39,6 +39,7 @@ Id = BigInteger().with_variant(Integer(), "sqlite")
 Blob = LargeBinary().with_variant(LONGBLOB(), "mysql", "mariadb")
 LongText = Text().with_variant(LONGTEXT(), "mysql", "mariadb")
 NAME_LENGTH = 255
+STRENGTH_COLUMNS = ("upper_strength", "lower_strength", "keyframe_strength")
 
 
 def _table(name: str, *columns: Any) -> Table:
@@ -171,7 +172,8 @@ keyframe_categories = _table(
     _ref("model_id", "models.id", cascade=False, primary_key=True, index=True),
     _ref("map_id", "maps.id"),
     Column("count", Integer, nullable=False),
-    Index(None, "map_id", "category_id", "keyframe_id", "count"),
+    *(Column(name, Integer, nullable=False, server_default="0") for name in STRENGTH_COLUMNS),
+    Index("ix_keyframe_categories_filter", "map_id", "category_id", "keyframe_id", "count", *STRENGTH_COLUMNS),
 )
 
 keypoints = _table(

@@ -11,6 +11,7 @@ import numpy as np
 from sqlalchemy import Connection, Engine, Table, insert, select, update
 from sqlalchemy.exc import IntegrityError
 
+from semdb.class_score import strengths
 from semdb.database import retry, tables
 from semdb.database.codecs import encode_array, encode_keypoints, encode_mask, image_format
 from semdb.database.engine import check_packet
@@ -112,7 +113,8 @@ class KeyframeWriter:
     def _encode(self, target: _Target, record: KeyframeRecord) -> _Rows:
         description = record.description
         by_role = {info.role: model_id for info, model_id in target.model_ids.items()}
-        category_ids = self._ids.categories(detection.category for detection in description.detections)
+        names = [*(d.category for d in description.detections), *(w.category for w in description.weak)]
+        category_ids = self._ids.categories(names)
         index = description.keypoints.object_index
         ordinals = np.arange(len(description.detections))
         starts = np.searchsorted(_sort_key(index), ordinals, side="left")
@@ -137,22 +139,14 @@ class KeyframeWriter:
                 {**features, "start": int(start), "count": int(end - start)}
                 for start, end in zip(starts, ends, strict=True)
             ],
-            categories=[
-                {
-                    "category_id": category_ids[name],
-                    "model_id": by_role["detector"],
-                    "map_id": target.map_id,
-                    "count": count,
-                }
-                for name, count in sorted(description.category_counts.items())
-            ],
+            categories=_category_rows(description, category_ids, by_role["detector"], target.map_id),
             keypoints={
                 **features,
                 "count": len(description.keypoints),
                 "count_3d": int(np.isfinite(points).all(axis=1).sum()),
                 "data": encode_keypoints(description.keypoints),
             },
-            descriptors={**features, "data": encode_array(description.keypoints.features.descriptors)},
+            descriptors={**features, "data": encode_array(_packed(description, record.descriptor_dtype))},
         )
 
 
@@ -180,6 +174,12 @@ def _check_description(description: Description) -> None:
         raise UsageError("a description has one geometry per detection")
     if description.cnn_vector.ndim != 1 or not np.isfinite(description.cnn_vector).all():
         raise UsageError("the CNN vector of a description is one finite row")
+
+
+def _packed(description: Description, dtype: str) -> np.ndarray[Any, Any]:
+    """Descriptors as they are stored. Those of bytes stay as they are."""
+    descriptors = description.keypoints.features.descriptors
+    return descriptors.astype(dtype) if descriptors.dtype == np.float32 else descriptors
 
 
 def _image_row(record: KeyframeRecord) -> dict[str, Any]:
@@ -213,6 +213,23 @@ def _object_rows(description: Description, category_ids: Mapping[str, int], mode
                 row[f"{name}_{axis}"] = float(value) if np.isfinite(value) else None
         rows.append(row)
     return rows
+
+
+def _category_rows(
+    description: Description, category_ids: Mapping[str, int], model_id: int, map_id: int
+) -> list[dict[str, Any]]:
+    counts, found = description.category_counts, strengths(description.evidence)
+    held = sum(sum(pair) for pair in found.values())
+    return [
+        {
+            "category_id": category_ids[name],
+            "model_id": model_id,
+            "map_id": map_id,
+            "count": counts.get(name, 0),
+            **dict(zip(tables.STRENGTH_COLUMNS, (*found.get(name, (0, 0)), held), strict=True)),
+        }
+        for name in sorted({*counts, *found})
+    ]
 
 
 def _write(
@@ -283,12 +300,13 @@ def _write_children(connection: Connection, keyframe_id: int, rows: _Rows) -> No
     for table, row in singles:
         _check_size(connection, table, row, rows.keyframe["frame_index"])
         connection.execute(insert(table), {**key, **row})
+    if rows.categories:
+        connection.execute(insert(tables.keyframe_categories), [{**key, **row} for row in rows.categories])
     if not rows.objects:
         return
     for row in rows.objects:
         _check_size(connection, tables.objects, row, rows.keyframe["frame_index"], 2)  # written in hexadecimal
     connection.execute(insert(tables.objects), [{**key, **row} for row in rows.objects])
-    connection.execute(insert(tables.keyframe_categories), [{**key, **row} for row in rows.categories])
     query = select(tables.objects.c.ordinal, tables.objects.c.id).where(tables.objects.c.keyframe_id == keyframe_id)
     object_ids = {row.ordinal: row.id for row in connection.execute(query)}
     slices = [{**row, "object_id": object_ids[ordinal]} for ordinal, row in enumerate(rows.slices)]

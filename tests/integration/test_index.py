@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from sqlalchemy import insert, update
+from sqlalchemy import insert, select, update
 
-from semdb.class_score import class_query
+from semdb.class_score import class_query, strength_query
 from semdb.database import retry
 from semdb.database.codecs import encode_array
 from semdb.database.records import ChangeKind
@@ -41,12 +41,15 @@ def assert_same(index: CoarseSource, sql: CoarseSource, seed: int, queries: int 
         counts = {str(name): float(random.uniform(0.2, 4).__round__(1)) for name in names}
         vector = description(int(random.integers(1000))).cnn_vector
         query = class_query(counts, sql.keyframe_count(), expected)
+        pairs = {name: tuple(random.integers(0, 60, 2).tolist()) for name in counts}
+        strong = strength_query(pairs, sql.keyframe_count(), expected, {"cup": (9, 30)})
         for share, at_most in ((0.0, None), (0.5, None), (0.3, 3)):
-            a, b = index.filtered(query, share, at_most), sql.filtered(query, share, at_most)
-            assert a.keyframe_ids.tolist() == b.keyframe_ids.tolist()
-            assert a.class_scores.tolist() == b.class_scores.tolist()
-            assert index.cosines(vector, a.keyframe_ids).tolist() == sql.cosines(vector, b.keyframe_ids).tolist()
-        for classes, weight, count in ((query, 0.15, 5), (None, 0.0, 1000)):
+            for asked in (query, strong):
+                a, b = index.filtered(asked, share, at_most), sql.filtered(asked, share, at_most)
+                assert a.keyframe_ids.tolist() == b.keyframe_ids.tolist()
+                assert a.class_scores.tolist() == b.class_scores.tolist()
+                assert index.cosines(vector, a.keyframe_ids).tolist() == sql.cosines(vector, b.keyframe_ids).tolist()
+        for classes, weight, count in ((query, 0.15, 5), (strong, 0.15, 7), (None, 0.0, 1000)):
             c, d = index.nearest(vector, count, classes, weight), sql.nearest(vector, count, classes, weight)
             assert c.keyframe_ids.tolist() == d.keyframe_ids.tolist()
             assert c.class_scores.tolist() == d.class_scores.tolist()
@@ -63,7 +66,10 @@ def redescribe(store: Store, map_id: int, keyframe_id: int, seed: int) -> None:
 
     def work(connection: object) -> None:
         connection.execute(update(cnn_vectors).where(v.keyframe_id == keyframe_id).values(vector=vector))  # type: ignore[attr-defined]
-        more = update(keyframe_categories).where(c.keyframe_id == keyframe_id).values(count=c.count + 1 + seed % 300)
+        lower = select(c.lower_strength).where(c.keyframe_id == keyframe_id)
+        held = [int(value) + seed % 200 for value in connection.execute(lower).scalars()]  # type: ignore[attr-defined]
+        more = update(keyframe_categories).where(c.keyframe_id == keyframe_id)
+        more = more.values(count=c.count + 1 + seed % 300, upper_strength=seed % 200, keyframe_strength=sum(held))
         connection.execute(more)  # type: ignore[attr-defined]
         connection.execute(insert(keyframe_changes), change)  # type: ignore[attr-defined]
 

@@ -26,7 +26,7 @@ from semdb.errors import SemdbError
 from semdb.localization.index.vectors import Part
 from semdb.types import Float32Array
 
-ARRAYS_MAGIC = b"SDBINDX1"
+ARRAYS_MAGIC = b"SDBINDX2"
 VECTORS_MAGIC = b"SDBVECT1"
 _ARRAYS = struct.Struct("<8sII")  # magic, bytes of the JSON, its checksum
 _VECTORS = struct.Struct("<8s16sQI28x")  # magic, id, rows, numbers per row

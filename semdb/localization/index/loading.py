@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from semdb.class_score import MOST_OBJECTS
+from semdb.class_score import MOST_OBJECTS, word
 from semdb.database.scanning import MapSums
 from semdb.database.store import Store
 from semdb.localization.index.cache_folder import CacheFolder
@@ -41,7 +41,10 @@ def load_mirror(
 
     parts = _parts(pieces(), folder)
     ids = np.concatenate(read) if read else np.empty(0, np.int64)
-    columns = {name: store.category_column(map_id, key) for key, name in store.map_categories(map_id)}
+    columns: dict[str, tuple[Int64Array, Int64Array]] = {}
+    for key, name in store.map_categories(map_id):
+        keys, numbers = store.category_columns(map_id, key)
+        columns.update((word(name, part), (keys, column)) for part, column in numbers.items())
     names, counts = category_matrix(ids, columns)
     mirror = Mirror(options)
     mirror.set_rows(ids, np.ones(len(ids), np.bool_), names, counts, parts)
@@ -65,9 +68,8 @@ def _parts(pieces: Iterator[Float32Array], folder: CacheFolder | None) -> list[P
 def same_as_database(store: Store, map_id: int, mirror: Mirror, state: State) -> bool:
     """Whether the mirror has the keyframes and objects that the database has, as far as sums and samples tell."""
     living = state.ids if state.living == len(state.ids) else state.ids[state.alive]
-    pairs, objects = mirror.objects(state)
-    mine = MapSums(len(living), int(living.sum()), pairs, objects)
-    if store.map_sums(map_id, MOST_OBJECTS) != mine:
+    mine = MapSums(len(living), int(living.sum()), *mirror.sums(state))
+    if store.map_sums(map_id) != mine:
         return False
     if not len(living):
         return True
@@ -82,5 +84,5 @@ def same_as_database(store: Store, map_id: int, mirror: Mirror, state: State) ->
     return all(
         name in state.categories
         and state.counts[state.categories[name], place_of[keyframe_id]] == min(number, MOST_OBJECTS)
-        for keyframe_id, name, number in rows.objects
+        for keyframe_id, name, number in rows.words
     )

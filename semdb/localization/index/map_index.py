@@ -150,7 +150,7 @@ class MapIndex:
             if len(rows.ids) and state.vectors.size not in (0, rows.vectors.shape[1]):
                 self._build("its keyframes are described by another encoder now", None)
                 return
-            self._mirror.append(rows.ids, rows.vectors, rows.objects)
+            self._mirror.append(rows.ids, rows.vectors, rows.words)
         self._unsaved += len(gone) + len(wanted)
 
     def _agrees(self) -> bool:

@@ -14,7 +14,7 @@ from semdb.localization.index.kernels import ByteArray, CodeArray
 from semdb.localization.index.reduction import Reduction, fit_reduction, sample_rows
 from semdb.localization.index.state import State, order_of
 from semdb.localization.index.vectors import Part, Tail, Vectors
-from semdb.types import BoolArray, Float32Array, Int64Array
+from semdb.types import BoolArray, Float32Array, Int64Array, IntArray
 
 Number = TypeVar("Number", bound=np.generic)
 SPARE_CLASSES = 16
@@ -44,6 +44,7 @@ class Mirror:
         self._ids: Int64Array = np.empty(SPARE_ROWS, np.int64)
         self._alive: BoolArray = np.empty(0, np.bool_)  # replaced, never changed: states share it
         self._counts: ByteArray = np.zeros((SPARE_CLASSES, SPARE_ROWS), np.uint8)
+        self._held: IntArray = np.zeros(SPARE_ROWS, np.int32)
         self._frequencies: Int64Array = np.zeros(SPARE_CLASSES, np.int64)
         self._codes: CodeArray | None = None
 
@@ -66,6 +67,7 @@ class Mirror:
             sorted_rows=order_of(ids, self._alive),
             categories=dict(self.categories),
             counts=self._counts,
+            held=self._held[:count],
             frequencies=self._frequencies.copy(),
             vectors=self._vectors(),
             reduction=self.reduction,
@@ -90,22 +92,30 @@ class Mirror:
         self._frequencies = np.zeros(len(self._counts), np.int64)
         for row in range(len(names)):
             self._frequencies[row] = np.count_nonzero(counts[row, : self._count] * alive.view(np.uint8))
+        self._held = np.zeros(counts.shape[1], np.int32)
+        for row in self._strengths():
+            self._held += self._counts[row]
         self.parts, self.tail = list(parts), None
 
-    def append(self, ids: Int64Array, vectors: Float32Array, objects: Iterable[tuple[int, str, int]]) -> None:
-        """Adds keyframes ``ids[n]`` with vectors ``[n, d]``; `objects` are keyframe, class and number."""
+    def _strengths(self) -> list[int]:
+        """The rows of `counts` that are strengths, not numbers of objects."""
+        return [row for name, row in self.categories.items() if "\n" in name]
+
+    def append(self, ids: Int64Array, vectors: Float32Array, words: Iterable[tuple[int, str, int]]) -> None:
+        """Adds keyframes ``ids[n]`` with vectors ``[n, d]``; `words` are keyframe, word and number."""
         if not len(ids):
             return
         first, count = self._count, self._count + len(ids)
-        objects = list(objects)
-        self._reserve(count, {name for _, name, _ in objects})
+        words = list(words)
+        self._reserve(count, {name for _, name, _ in words})
         self._ids[first:count] = ids
         self._counts[:, first:count] = 0
         rows = {keyframe_id: first + place for place, keyframe_id in enumerate(ids.tolist())}
-        for keyframe_id, name, number in objects:
+        for keyframe_id, name, number in words:
             at = self.categories[name], rows[keyframe_id]
             self._counts[at] = min(MOST_OBJECTS, int(self._counts[at]) + number)
         self._frequencies += np.count_nonzero(self._counts[:, first:count], axis=1)
+        self._held[first:count] = self._counts[self._strengths(), first:count].sum(axis=0, dtype=np.int32)
         if self.tail is None:
             self.tail = Tail(vectors.shape[1])
         self.tail.append(vectors)
@@ -131,6 +141,7 @@ class Mirror:
                 [self._frequencies, np.zeros(classes - len(self._frequencies), np.int64)]
             )
         self._ids = _grown(self._ids, self._count, room)
+        self._held = _grown(self._held, self._count, room)
         if self._codes is not None:
             self._codes = _grown(self._codes, self._count, room)
 
@@ -179,6 +190,7 @@ class Mirror:
         rows = np.flatnonzero(self._alive)
         self._ids = self._ids[rows]
         self._counts = self._counts[:, rows]
+        self._held = self._held[rows]
         if self._codes is not None:
             self._codes = self._codes[rows]
         self._alive = np.ones(len(rows), np.bool_)
@@ -202,8 +214,8 @@ class Mirror:
             }
         return found
 
-    def objects(self, state: State) -> tuple[int, int]:
-        """Pairs of living keyframe and class that it shows, and objects in them."""
+    def sums(self, state: State) -> tuple[int, int]:
+        """Pairs of a living keyframe and a word that it has, and the sum of their numbers."""
         pairs = total = 0
         for row in range(len(state.categories)):
             column = self._counts[row, : self._count]

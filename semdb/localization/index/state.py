@@ -17,7 +17,7 @@ from semdb.localization.index.kernels import ByteArray, CodeArray, best_rows, cl
 from semdb.localization.index.reduction import Reduction
 from semdb.localization.index.vectors import Vectors
 from semdb.localization.ranking import best_first
-from semdb.types import BoolArray, Float32Array, FloatArray, Int64Array
+from semdb.types import BoolArray, Float32Array, FloatArray, Int64Array, IntArray
 
 SMALL = 20_000  # rows below which threads cost more than they save
 
@@ -30,8 +30,9 @@ class State:
     alive: BoolArray  # [n]
     living: int  # how many are alive
     sorted_rows: Int64Array | None  # rows in ascending order of id, the living alone; None: 0..n are that
-    categories: Mapping[str, int]  # name -> row of `counts`
+    categories: Mapping[str, int]  # word (`semdb.class_score.word`) -> row of `counts`
     counts: ByteArray  # [classes, n or more]
+    held: IntArray  # [n] strength of all that a keyframe shows
     frequencies: Int64Array  # [classes] living keyframes that show a class
     vectors: Vectors
     reduction: Reduction | None = None
@@ -42,7 +43,7 @@ class State:
     def filtered(self, query: ClassQuery, minimum_share: float, at_most: int | None) -> Scored:
         """As `CoarseSource.filtered`."""
         rows, sums = self._filtered_rows(query, minimum_share, at_most)
-        return Scored(self.ids[rows], sums / max(1, query.total))
+        return Scored(self.ids[rows], sums / query.whole)
 
     def _filtered_rows(
         self, query: ClassQuery, minimum_share: float, at_most: int | None
@@ -76,7 +77,7 @@ class State:
     def nearest(self, vector: Float32Array, count: int, query: ClassQuery | None, class_weight: float) -> Ranked:
         """As `CoarseSource.nearest`; exact where there is no reduction."""
         sums = self._sums(query) if query is not None else None
-        total = 1 if query is None else max(1, query.total)
+        total = 1 if query is None else query.whole
         if self.reduction is None:
             rows = np.arange(len(self.ids)) if self.living == len(self.ids) else np.flatnonzero(self.alive)
         else:
@@ -111,15 +112,20 @@ class State:
         return out
 
     def _sums(self, query: ClassQuery) -> Int64Array | None:
-        """The sum of terms of every row ``[n]``; None where no class of the query is known."""
-        known = [term for term in query.terms if term.category in self.categories]
+        """The points of every row ``[n]``; None where no class of the query is known."""
+        known = [term for term in query.terms if term.word in self.categories]
         if not known or not len(self.ids):
             return None
         objects = np.arange(MOST_OBJECTS + 1, dtype=np.int64)
         tables = np.array([np.minimum(term.full, term.per_object * objects) for term in known])
-        rows = np.array([self.categories[term.category] for term in known], np.int64)
+        rows = np.array([self.categories[term.word] for term in known], np.int64)
         out = np.empty(len(self.ids), np.int64)
-        self._spread(lambda start, stop: class_sums(self.counts, rows, tables, start, stop, out))
+
+        def part(start: int, stop: int) -> None:
+            class_sums(self.counts, rows, tables, start, stop, out)
+            out[start:stop] = query.points(out[start:stop], self.held[start:stop].astype(np.int64))
+
+        self._spread(part)
         return out
 
     def _best(self, scores: npt.NDArray[Any], least: float, count: int) -> Int64Array:
