@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from semdb.class_score import ClassQuery
@@ -148,6 +148,7 @@ def test_best_first_is_by_falling_score_then_by_id(scores: list[float], count: i
     assert [(-scores[p], int(ids[p])) for p in best_first(ids, np.array(scores))] == keys
 
 
+@settings(deadline=None)  # the kernel is compiled at the first call
 @given(size=st.integers(0, 40), rows=st.lists(st.integers(0, 8), max_size=9), seed=st.integers(0, 99))
 def test_a_cosine_does_not_depend_on_what_else_is_asked(size: int, rows: list[int], seed: int) -> None:
     random = np.random.default_rng(seed)
@@ -159,6 +160,7 @@ def test_a_cosine_does_not_depend_on_what_else_is_asked(size: int, rows: list[in
     np.testing.assert_allclose(together, vectors[rows].astype(np.float64) @ query.astype(np.float64), atol=1e-12)
 
 
+@settings(deadline=None)
 @given(
     scores=st.dictionaries(st.integers(0, 20), st.floats(0.01, 1), max_size=15),
     angles=st.lists(st.floats(0, 90), min_size=21, max_size=21),
