@@ -12,6 +12,7 @@ from semdb.database.store import Store
 from tests.database_samples import CATEGORIES, MODELS, fill, plan
 
 MAPS, RECORDINGS, FRAMES = 8, 3, 100  # of keyframes, and three objects each
+PLANNED = FRAMES + 10  # the last frames are not stored yet
 FIRST_KEYFRAME, FIRST_OBJECT = 10_000, 100_000
 OBJECTS = 3
 OF_KEYFRAME = ("keyframe_images", "cnn_vectors", "keypoints", "descriptors")
@@ -36,7 +37,7 @@ def fill_big(store: Store) -> list[int]:
     for number in range(MAPS):
         map_ids.append(store.ensure_map(f"big {number}"))
         for visit in range(RECORDINGS):
-            planned = store.plan_recording(map_ids[-1], plan(f"visit {visit}", range(FRAMES)), MODELS)
+            planned = store.plan_recording(map_ids[-1], plan(f"visit {visit}", range(PLANNED), frames=200), MODELS)
             rows.add_recording(map_ids[-1], planned.recording_id, (number * RECORDINGS + visit) * FRAMES)
     with store.engine.begin() as connection:
         rows.insert(connection)
@@ -86,10 +87,9 @@ class _Rows:
     def insert(self, connection: Connection) -> None:
         for name, rows in self.by_table.items():
             connection.execute(insert(tables.metadata.tables[name]), rows)
-        # The plan, as `plan_recording` wrote it, was carried out but for one frame in ten.
         item = tables.ingest_items
-        planned = item.update().where(item.c.frame_index % 10 != 0, item.c.frame_index < FRAMES)
-        connection.execute(planned.values(state=ItemState.DONE.value))
+        stored = item.c.frame_index < FRAMES
+        connection.execute(item.update().where(stored).values(state=ItemState.DONE.value))
 
 
 def _first(connection: Connection, table: Table, column: str, key: int) -> dict[str, Any]:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import contextlib
 import inspect
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
 import pytest
@@ -21,8 +21,8 @@ from semdb.database import schema
 from semdb.database.engine import make_engine
 from semdb.database.store import Store, open_store
 from semdb.errors import NotFoundError
-from semdb.types import Localization, Verdict
-from tests.big_database import FIRST_KEYFRAME, FRAMES, RECORDINGS, fill_big
+from semdb.types import Int64Array, Localization, Verdict
+from tests.big_database import FIRST_KEYFRAME, FRAMES, PLANNED, RECORDINGS, fill_big
 from tests.database_samples import MODELS, description, plan, record
 from tests.query_plans import checked_plans
 
@@ -86,7 +86,7 @@ def test_all_that_the_store_sends_uses_indexes(big: Big) -> None:
     assert called == public - {"close", "url"}
     assert len(check.statements) > 40
     assert not check.full_scans, "\n".join(check.full_scans)
-    assert len(big.store.keyframe_ids(big.map_ids[0])) == RECORDINGS * FRAMES
+    assert len(big.store.keyframe_ids(big.map_ids[0])) == RECORDINGS * FRAMES + 1
     assert len(big.store.keyframe_ids(big.map_ids[3])) == RECORDINGS * FRAMES - 20
     with pytest.raises(NotFoundError):
         big.store.find_map("big 6")
@@ -125,10 +125,10 @@ def _values(store: Store, map_ids: list[int]) -> dict[str, Any]:
         "map_name": "big 0",
         "recording": "visit 1",
         "models": MODELS,
-        "plan": plan("visit 0", range(FRAMES)),
+        "plan": plan("visit 0", range(PLANNED), frames=200),
         "record": record(1, description(1, ["chair"])),
-        "write_keyframe.record": record(10, description(10, ["chair", "cup"])),
-        "frame_index": 20,
+        "write_keyframe.record": record(FRAMES + 3, description(10, ["chair", "cup"])),
+        "frame_index": FRAMES + 5,
         "error": "made up",
         "counts": COUNTS,
         "query": store.class_query(map_ids[0], COUNTS),
@@ -140,22 +140,37 @@ def _values(store: Store, map_ids: list[int]) -> dict[str, Any]:
         "image": "query.png",
         "localization": lost,
         "worker": "a worker",
+        "parameters": {},
+        "write": lambda *_: 0,
+        "result": (),
     }
 
 
 def _arguments(name: str, method: Callable[..., Any], values: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The arguments of one call with all parameters, and of one without those that may be left out."""
     everything, needed = {}, {}
+    hints = get_type_hints(method)
     for parameter in inspect.signature(method).parameters.values():
-        key = parameter.name
+        key, optional = parameter.name, parameter.default is not inspect.Parameter.empty
         value = values.get(f"{name}.{key}", values.get(key))
-        if value is None and parameter.default is inspect.Parameter.empty:
+        if value is None and not optional:
+            value = _made_up(hints[key])
+        if value is None and not optional:
             pytest.fail(f"Store.{name} takes {key!r}: give a value for it in _values")
         if value is not None:
             everything[key] = value
-        if parameter.default is inspect.Parameter.empty:
+        if not optional:
             needed[key] = value
     return [everything] if everything.keys() == needed.keys() else [everything, needed]
+
+
+def _made_up(hint: Any) -> Any:
+    """A value of a type, for parameters that nothing is known of."""
+    if get_origin(hint) in (Sequence, Iterable, Collection):
+        return {int: KEYFRAMES, str: list(COUNTS)}.get(get_args(hint)[0])
+    if hint == Int64Array:
+        return np.array(KEYFRAMES)
+    return {int: 1, float: 1.0, str: "made up", bool: True}.get(hint)
 
 
 def test_all_that_commands_send_uses_indexes(
@@ -173,6 +188,7 @@ def test_all_that_commands_send_uses_indexes(
         ["status", "--map", "big 4"],
         ["localize", images[4], images[9], "--map", "room", "--json", "--coarse", "sql"],
         ["localize", images[4], images[9], "--map", "room", "--json", "--coarse", "index"],
+        ["refine", "--map", "room"],
         ["keypoints", FIRST_KEYFRAME + FOURTH, "--csv"],
         ["retry"],
         ["delete", "keyframes", FIRST_KEYFRAME + FOURTH, "--yes"],
