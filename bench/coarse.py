@@ -41,6 +41,7 @@ NEWS = 5
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("recordings", nargs="*", help="taken by all benchmarks, not used by this one")
     parser.add_argument("--keyframes", default="10000,100000", help="sizes of maps, multiples of 1000")
     parser.add_argument("--million", action="store_true", help="a map of 1000000 too: about 20 GB of disk")
     parser.add_argument("--data-dir", type=Path, help="keep the filled server here, and use it again")
@@ -155,7 +156,7 @@ def time_to_find(url: str, index: MapIndex, seed: int) -> list[float]:
     return seconds
 
 
-PROBE = [sys.executable, "-m", "bench.coarse_probe"]
+PROBE = [sys.executable, "-m", "bench._coarse_probe"]
 
 
 def percentiles(milliseconds: list[float]) -> dict[str, float]:

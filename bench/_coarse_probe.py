@@ -1,7 +1,7 @@
 """What the benchmark of the coarse step needs a fresh process for; prints JSON.
 
-``python -m bench.coarse_probe open URL CACHE KEYFRAMES SEED THREADS`` opens the index, asks it some queries, and says
-how long it took and how much memory it holds. ``python -m bench.coarse_probe write URL SEED`` stores a keyframe per
+``python -m bench._coarse_probe open URL CACHE KEYFRAMES SEED THREADS`` opens the index, asks it some queries, and says
+how long it took and how much memory it holds. ``python -m bench._coarse_probe write URL SEED`` stores a keyframe per
 line that it reads, says when it was committed, and deletes them all in the end.
 """
 
