@@ -1,12 +1,19 @@
-"""`semdb models`: which models made the rows, and which can be named in settings."""
+"""`semdb models`: which models made the rows, which can be named in settings, and where their files come from."""
 
 from __future__ import annotations
 
-from typing import Any
+import functools
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from semdb.cli.options import JsonFlag, Overrides, settings_options
+from semdb.errors import UsageError
+
+if TYPE_CHECKING:
+    from semdb.cli.progress import Progress
+    from semdb.settings import Settings
 
 command = typer.Typer(
     help="The networks and features that describe images.",
@@ -19,8 +26,10 @@ command = typer.Typer(
 SPECS = (
     ("detector", "recorded", False, "object masks that come with the recording"),
     ("detector", "onnx:FILE", True, "a Mask R-CNN with the outputs boxes, labels, scores, masks"),
+    ("detector", "torchvision:NAME|PATH", True, "a Mask R-CNN in torch: a published one, or a checkpoint"),
     ("encoder", "gist", False, "training-free global descriptor"),
     ("encoder", "onnx:FILE", True, "a CNN from image [B,3,224,224] (RGB, 0..1) to embedding"),
+    ("encoder", "torchvision:NAME|PATH", True, "a ResNet in torch: a published one, or a checkpoint"),
     ("features", "surf", False, "SURF, 64 dimensions"),
     ("features", "sift", False, "SIFT of OpenCV"),
     ("features", "orb", False, "ORB of OpenCV, binary"),
@@ -29,30 +38,130 @@ SPECS = (
 
 @command.callback()
 def group() -> None:
-    """The networks and features that describe images."""  # keeps `list` a subcommand while it is the only one
+    """The networks and features that describe images."""
 
 
 @command.command("list")
 @settings_options(models=True)
 def list_models(overrides: Overrides, json: JsonFlag = False) -> None:
-    """List the specs that settings can name, what is set, and which models made the rows of each map."""
+    """List the specs that settings can name, the model files at hand, and which models made the rows of each map."""
     from semdb.cli.output import print_json, print_table
 
     settings = overrides.settings()
     chosen = {role: str(getattr(settings, role)) for role in ("detector", "encoder", "features")}
     used = used_models(settings.database_url)
+    files = model_files(settings, used or [])
     if json:
         specs = [{"role": r, "spec": s, "needs_file": f, "description": d} for r, s, f, d in SPECS]
-        print_json({"specs": specs, "settings": chosen, "maps": used})
+        print_json({"specs": specs, "settings": chosen, "files": files, "maps": used})
         return
     print_table(("role", "spec", "description"), [(role, spec, text) for role, spec, _, text in SPECS])
-    print("\nset: " + ", ".join(f"{role} {spec}" for role, spec in chosen.items()))
+    print("\nset: " + ", ".join(f"{role} {spec}" for role, spec in chosen.items()) + "\n")
+    print_table(
+        ("file", "spec", "at hand", "sha256", "licence", "made the rows of"),
+        [
+            (f["file"], f["spec"], "yes" if f["sha256"] else "no", f["sha256"][:12], f["licence"], ", ".join(f["maps"]))
+            for f in files
+        ],
+    )
+    print(f"\nfolder: {files_folder(settings)}; `semdb models pull NAME` fetches what is not at hand")
     if not used:
         print("maps: " + ("no database yet" if used is None else "none yet"))
         return
     print()
     columns = ("map", "role", "name", "sha256", "config")
     print_table(columns, [(u["map"], u["role"], u["name"], u["sha256"][:12], u["config"]) for u in used])
+
+
+@command.command("pull")
+def pull_models(
+    names: Annotated[list[str], typer.Argument(metavar="NAME...", help="Published models by name, or all.")],
+) -> None:
+    """Download the weights of published models into the models folder.
+
+    A download that broke off goes on where it stopped. The hash of every file is checked. Nothing else in semdb uses
+    the network.
+    """
+    from semdb.cli.options import load_settings
+    from semdb.cli.progress import Progress as Bar
+    from semdb.perception.catalogue import BY_NAME, PUBLISHED
+    from semdb.perception.pull import pull
+
+    unknown = [name for name in names if name != "all" and name not in BY_NAME]
+    if unknown:
+        raise UsageError(f"no published model {', '.join(unknown)}: known are {', '.join(BY_NAME)}, and all")
+    folder = files_folder(load_settings())
+    for model in PUBLISHED if "all" in names else [BY_NAME[name] for name in dict.fromkeys(names)]:
+        with Bar(f"pulling {model.name}", unit="MB") as progress:
+            done = pull(model, folder, functools.partial(_show_megabytes, progress))
+        print(
+            f"{model.name}: {'pulled' if done.fetched else 'there already'}, {done.path}, sha256 {done.sha256[:16]}…"
+            + (" (recorded: its publisher gives none)" if done.recorded else ", as it should be")
+            + f"; licence {model.licence}; use it as {model.spec}"
+        )
+
+
+def _show_megabytes(progress: Progress, done: int, total: int) -> None:
+    progress.update(done >> 20, total >> 20)
+
+
+def files_folder(settings: Settings) -> Path:
+    """Where files of models are kept."""
+    from semdb.perception.model_files import models_dir
+
+    return models_dir(settings)
+
+
+def model_files(settings: Settings, used: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Published models, at hand or not, and other files in the models folder, with the maps whose rows they made.
+
+    ``sha256`` is empty for what is not at hand.
+    """
+    from semdb.perception.catalogue import PUBLISHED
+    from semdb.perception.model_files import file_sha256
+
+    folder = files_folder(settings)
+    rows = [
+        {"name": m.name, "role": m.role, "file": m.file, "spec": m.spec, "licence": m.licence, "url": m.url}
+        for m in PUBLISHED
+    ]
+    known = {row["file"] for row in rows}
+    if folder.is_dir():
+        for path in sorted(folder.iterdir()):
+            if path.name not in known and path.suffix in (".onnx", ".pth", ".tar"):
+                spec = f"{'onnx' if path.suffix == '.onnx' else 'torchvision'}:{path.name}"
+                row = {
+                    "name": path.name,
+                    "role": "",
+                    "file": path.name,
+                    "spec": spec,
+                    "licence": "not known",
+                    "url": "",
+                }
+                rows.append({**row, "licence": _licence_in(path)})
+    for row in rows:
+        path = folder / row["file"]
+        row["sha256"] = file_sha256(path) if path.is_file() else ""
+    return [
+        {**row, "maps": sorted({u["map"] for u in used if row["sha256"] and u["sha256"] == row["sha256"]})}
+        for row in rows
+    ]
+
+
+def _licence_in(path: Path) -> str:
+    """What an ONNX file says of its licence."""
+    from semdb.errors import ModelError
+    from semdb.perception.model_files import OnnxModel
+
+    if path.suffix == ".onnx":
+        try:
+            metadata = OnnxModel(path, 1, ()).metadata
+        except ModelError:
+            return "cannot be read"
+        for key in ("licence", "license"):
+            if metadata.get(key):
+                return metadata[key]
+    return "not known"
 
 
 def used_models(url: str) -> list[dict[str, Any]] | None:
