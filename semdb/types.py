@@ -79,23 +79,31 @@ class Frame:
     depth_registration: str = ""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Detection:
-    """One object in an image: COCO-style class name, score 0..1, box x1, y1, x2, y2 (last pixel inside), mask."""
-
-    category: str
-    score: float
-    box: Float32Array  # [4]
-    mask: BoolArray  # [H, W]
-
-
 @dataclass(frozen=True, slots=True)
-class WeakDetection:
-    """What a detector was not sure of, or saw beside another object: no object, but evidence of a class."""
+class Sighting:
+    """Something that a detector saw, sure or not: evidence of a class, whether it is kept as an object or not."""
 
     category: str
     score: float
     height: float  # of the centre of its box, 0 at the top of the image, 1 at the bottom
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Detection:
+    """One object in an image: COCO-style class name, score 0..1, box x1, y1, x2, y2 (last pixel inside), mask.
+
+    A `weak` one has too low a score to be kept as an object, and no mask.
+    """
+
+    category: str
+    score: float
+    box: Float32Array  # [4]
+    mask: BoolArray  # [H, W]; [0, 0] of a weak one
+    weak: bool = False
+
+    def sighting(self, height: int) -> Sighting:
+        """What it says of its class in an image of `height` pixels."""
+        return Sighting(self.category, self.score, (float(self.box[1]) + float(self.box[3]) + 1) / (2 * height))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -160,7 +168,7 @@ class Description:
     cnn_vector: Float32Array  # [d], L2-normalised
     models: tuple[ModelInfo, ...]  # detector, encoder, features
     timing_ms: Mapping[str, float] = field(default_factory=dict)  # detect, encode, features
-    weak: tuple[WeakDetection, ...] = ()  # beside the detections
+    sightings: tuple[Sighting, ...] | None = None  # all that the detector saw; None: the detections
     dynamic: frozenset[str] = frozenset()  # categories of objects that move: they say nothing about a place
 
     @property
@@ -173,13 +181,11 @@ class Description:
 
     @property
     def evidence(self) -> list[tuple[str, float, float]]:
-        """Class, score and height in the image (0 top, 1 bottom) of all detections, weak ones too."""
-        strong = [
-            (d.category, d.score, (float(d.box[1]) + float(d.box[3]) + 1) / (2 * self.camera.height))
-            for d in self.detections
-        ]
-        weak = [(w.category, w.score, w.height) for w in self.weak]
-        return [item for item in (*strong, *weak) if item[0] not in self.dynamic]
+        """Class, score and height in the image (0 top, 1 bottom) of all that was seen and does not move."""
+        seen = self.sightings
+        if seen is None:
+            seen = tuple(d.sighting(self.camera.height) for d in self.detections)
+        return [(s.category, s.score, s.height) for s in seen if s.category not in self.dynamic]
 
 
 class Verdict(StrEnum):

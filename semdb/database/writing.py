@@ -113,7 +113,7 @@ class KeyframeWriter:
     def _encode(self, target: _Target, record: KeyframeRecord) -> _Rows:
         description = record.description
         by_role = {info.role: model_id for info, model_id in target.model_ids.items()}
-        names = [*(d.category for d in description.detections), *(w.category for w in description.weak)]
+        names = {*(d.category for d in description.detections), *(item[0] for item in description.evidence)}
         category_ids = self._ids.categories(names)
         index = description.keypoints.object_index
         ordinals = np.arange(len(description.detections))

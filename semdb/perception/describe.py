@@ -27,6 +27,7 @@ from semdb.types import (
     Keypoints,
     ModelInfo,
     ObjectGeometry,
+    Sighting,
 )
 
 _Result = TypeVar("_Result")
@@ -73,7 +74,7 @@ class Describer:
         does not bring.
         """
         _check_sizes(image, depth, camera)
-        detections, detect_ms = _timed(lambda: self.rules.apply(self.detector.detect(image, instances)))
+        (detections, sightings), detect_ms = _timed(lambda: self._detect(image, instances))
         vector, encode_ms = _timed(lambda: self.encoder.encode(image))
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         found, extract_ms = _timed(lambda: self.features.extract(grey, self.rules.still(detections)))
@@ -86,8 +87,18 @@ class Describer:
             cnn_vector=vector,
             models=self.models,
             dynamic=frozenset(self.rules.dynamic),
+            sightings=sightings,
             timing_ms={"detect": detect_ms, "encode": encode_ms, "features": extract_ms + lift_ms},
         )
+
+    def _detect(
+        self, image: ImageArray, instances: InstanceMasks | None
+    ) -> tuple[tuple[Detection, ...], tuple[Sighting, ...]]:
+        """What is kept as objects, and all that was seen, of the classes that count."""
+        found = self.detector.detect(image, instances)
+        counted = [d for d in found if self.rules.classes is None or d.category in self.rules.classes]
+        sightings = tuple(d.sighting(image.shape[0]) for d in counted)
+        return self.rules.apply([d for d in found if not d.weak]), sightings
 
 
 def describer_from_specs(detector: str, encoder: str, features: str, settings: Settings) -> Describer:

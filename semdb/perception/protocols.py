@@ -26,7 +26,8 @@ class Detector(Protocol):
     def detect(self, image: ImageArray, instances: InstanceMasks | None) -> tuple[Detection, ...]:
         """Objects of an RGB `image` ``[H, W, 3]``, by descending score; masks are ``[H, W]`` and never empty.
 
-        `instances` are the masks that came with the image, for the detector that takes them; others ignore them.
+        After them may come `weak` ones, without masks: down to which score is part of `info`. `instances` are the
+        masks that came with the image, for the detector that takes them; others ignore them.
         Raises ModelError when the model fails on the image.
         """
         ...

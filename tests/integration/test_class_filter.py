@@ -21,7 +21,7 @@ from semdb.database.records import ScoredKeyframe
 from semdb.database.store import Store, open_store
 from semdb.database.tables import categories, keyframe_categories
 from semdb.errors import UsageError
-from semdb.types import WeakDetection
+from semdb.types import Sighting
 from tests.database_samples import CATEGORIES, MODELS, description, fill, plan, record
 
 SHOWN: tuple[list[str], ...] = (
@@ -161,7 +161,7 @@ def _sighted(store: Store, map_name: str = "room") -> tuple[int, list[int]]:
     planned = store.plan_recording(map_id, plan("r", range(len(SIGHTS))), MODELS)
     ids = []
     for index, sights in enumerate(SIGHTS):
-        made = replace(description(index, [], keypoints=3), weak=tuple(WeakDetection(*sight) for sight in sights))
+        made = replace(description(index, [], keypoints=3), sightings=tuple(Sighting(*sight) for sight in sights))
         ids.append(store.write_keyframe(planned.recording_id, record(index, made)).keyframe_id)
     return map_id, ids
 

@@ -46,8 +46,15 @@ def test_onnx_takes_rgb_from_0_to_1_and_sorts_by_score(tmp_path: Path) -> None:
     detector = load_detector(three(tmp_path, [62, 67, 47]), settings())
     found = detector.detect(colour(153, 51, 255), None)
     # red 0.6 is the first object's score, green 0.2 (below the threshold) the second's, blue 1.0 the third's
-    assert [d.category for d in found] == ["cup", "chair"]
-    assert [d.score for d in found] == pytest.approx([1.0, 0.6], abs=1e-6)
+    assert [(d.category, d.weak) for d in found] == [("cup", False), ("chair", False), ("dining table", True)]
+    assert [d.score for d in found] == pytest.approx([1.0, 0.6, 0.2], abs=1e-6)
+    assert found[2].mask.shape == (0, 0)
+
+
+def test_onnx_drops_what_it_hardly_saw(tmp_path: Path) -> None:
+    detector = load_detector(three(tmp_path, [62, 67, 47]), settings(0.9))
+    found = detector.detect(colour(12, 13, 255), None)  # 0.047, 0.051
+    assert [(d.category, d.weak) for d in found] == [("cup", False), ("dining table", True)]
 
 
 def test_onnx_boxes_stay_inside_and_masks_are_cut_at_one_half(tmp_path: Path) -> None:
@@ -113,7 +120,7 @@ def test_onnx_info_names_the_file_without_its_folder(tmp_path: Path) -> None:
     info = load_detector(spec, settings(0.5)).info
     assert (info.role, info.name) == ("detector", "onnx:three.onnx")
     assert info.sha256 == hashlib.sha256((tmp_path / "three.onnx").read_bytes()).hexdigest()
-    assert json.loads(info.config) == {"mask_threshold": 0.5, "score_threshold": 0.5}
+    assert json.loads(info.config) == {"mask_threshold": 0.5, "score_threshold": 0.5, "weak_threshold": 0.05}
     assert load_detector(spec, Settings(score_threshold=0.5, threads=2)).info == info
     assert load_detector(spec, settings(0.6)).info != info
 
@@ -207,7 +214,10 @@ def test_real_mask_rcnn_on_real_frames(shared_dir: Path) -> None:
     detector = load_detector(f"onnx:{shared_dir}/models/mask_rcnn_2go.onnx", settings(0.75))
     scene = shared_dir / "recordings" / "7scenes_redkitchen" / "seq-01"
     image = cv2.imread(str(scene / "frame-000000.color.jpg"))[..., ::-1].copy()
-    found = detector.detect(image, None)
+    everything = detector.detect(image, None)
+    found = [detection for detection in everything if not detection.weak]
+    assert len(everything) > 3 * len(found)
+    assert min(detection.score for detection in everything) >= 0.05
     assert [d.category for d in found] == ["chair", "dining table", "chair"]
     assert [d.score for d in found] == pytest.approx([0.97, 0.96, 0.91], abs=0.006)
     for detection in found:

@@ -12,9 +12,11 @@ from semdb.errors import ModelError
 from semdb.perception.detectors.coco import COCO_91, NO_OBJECT
 from semdb.perception.model_files import OnnxModel, canonical_json, file_sha256, resolve_onnx
 from semdb.settings import Settings
-from semdb.types import Detection, Float32Array, ImageArray, InstanceMasks, ModelInfo
+from semdb.types import BoolArray, Detection, Float32Array, ImageArray, InstanceMasks, ModelInfo
 
 MASK_THRESHOLD = 0.5
+WEAK_THRESHOLD = 0.05  # from here on what the network saw is evidence of a class; exports give no less
+NO_MASK: BoolArray = np.zeros((0, 0), dtype=np.bool_)
 _OUTPUTS = ("boxes", "labels", "scores", "masks")
 
 
@@ -22,8 +24,8 @@ class OnnxDetector:
     """A Mask R-CNN export: ``[1, 3, H, W]`` RGB 0..1 to boxes, labels, scores and masks in input pixels.
 
     Class names come from the file's ``metadata_props["classes"]`` (a JSON list by label), otherwise they are
-    COCO's. Detections below `score_threshold`, with an empty mask or with a label that stands for nothing are
-    dropped.
+    COCO's. Detections below `score_threshold` are weak; those below 0.05, with an empty mask or with a label that
+    stands for nothing are dropped.
     """
 
     def __init__(self, spec: str, settings: Settings) -> None:
@@ -31,7 +33,11 @@ class OnnxDetector:
         self._model = OnnxModel(path, settings.threads, _OUTPUTS, settings.device)
         self.classes = _class_names(self._model)
         self._score_threshold = settings.score_threshold
-        config = {"mask_threshold": MASK_THRESHOLD, "score_threshold": settings.score_threshold}
+        config = {
+            "mask_threshold": MASK_THRESHOLD,
+            "score_threshold": settings.score_threshold,
+            "weak_threshold": WEAK_THRESHOLD,
+        }
         self.info = ModelInfo("detector", f"onnx:{path.name}", file_sha256(path), canonical_json(config))
 
     def detect(self, image: ImageArray, instances: InstanceMasks | None = None) -> tuple[Detection, ...]:
@@ -45,13 +51,13 @@ class OnnxDetector:
         order = np.argsort(-scores, kind="stable")
         limits = np.array([width - 1, height - 1, width - 1, height - 1], dtype=np.float32)
         found = []
-        for k in order[scores[order] >= self._score_threshold]:
-            category = self._category(int(labels[k]))
-            mask = masks[k, 0] >= MASK_THRESHOLD
-            if category in NO_OBJECT or not mask.any():
+        for k in order[scores[order] >= min(WEAK_THRESHOLD, self._score_threshold)]:
+            category, weak = self._category(int(labels[k])), bool(scores[k] < self._score_threshold)
+            mask = NO_MASK if weak else masks[k, 0] >= MASK_THRESHOLD
+            if category in NO_OBJECT or not (weak or mask.any()):
                 continue
             box: Float32Array = np.clip(boxes[k], 0, limits).astype(np.float32)
-            found.append(Detection(category, float(scores[k]), box, mask))
+            found.append(Detection(category, float(scores[k]), box, mask, weak))
         return tuple(found)
 
     def _category(self, label: int) -> str:

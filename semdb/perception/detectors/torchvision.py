@@ -13,7 +13,7 @@ from semdb.errors import ModelError
 from semdb.perception import mask_rcnn
 from semdb.perception.catalogue import BY_NAME
 from semdb.perception.detectors.coco import COCO_91, NO_OBJECT
-from semdb.perception.detectors.onnx import MASK_THRESHOLD
+from semdb.perception.detectors.onnx import MASK_THRESHOLD, NO_MASK, WEAK_THRESHOLD
 from semdb.perception.mask_rcnn import Architecture
 from semdb.perception.model_files import canonical_json, file_sha256, first_line
 from semdb.perception.torch_models import (
@@ -40,15 +40,17 @@ _PUBLISHED = {
 class TorchvisionDetector:
     """Mask R-CNN in torch, on the device of the settings, in half precision on CUDA.
 
-    Detections below ``settings.score_threshold``, with an empty mask or with a label that stands for nothing are
-    dropped, as with `onnx:` files. The device is not part of the provenance: it changes results by rounding only.
+    Detections below ``settings.score_threshold`` are weak; those below 0.05, with an empty mask or with a label that
+    stands for nothing are dropped, as with `onnx:` files. The device is not part of the provenance: it changes results
+    by rounding only.
     """
 
     def __init__(self, spec: str, settings: Settings) -> None:
         self._torch = import_torch()
         path = resolve_checkpoint(spec, settings)
         network, self.architecture, self.classes = load_detector_checkpoint(path, _PUBLISHED.get(_name_of(spec)))
-        network.roi_heads.score_thresh = max(settings.score_threshold, 0.05)
+        network.roi_heads.score_thresh = WEAK_THRESHOLD
+        self._score_threshold = settings.score_threshold
         self._network = prepare(network, settings, self._torch)
         self._device = next(self._network.parameters()).device
         self._path = path
@@ -59,6 +61,7 @@ class TorchvisionDetector:
             "min_size": self.architecture.min_size,
             "max_size": self.architecture.max_size,
             "score_threshold": settings.score_threshold,
+            "weak_threshold": WEAK_THRESHOLD,
         }
         name = _name_of(spec) if _name_of(spec) in BY_NAME else path.name
         self.info = ModelInfo("detector", f"torchvision:{name}", file_sha256(path), canonical_json(config))
@@ -103,9 +106,11 @@ class TorchvisionDetector:
         found = []
         for k in np.argsort(-scores, kind="stable"):
             category = self.classes[int(labels[k])]
-            if category not in NO_OBJECT and masks[k].any():
+            weak = bool(scores[k] < self._score_threshold)
+            if category not in NO_OBJECT and (weak or masks[k].any()):
                 box: Float32Array = np.clip(boxes[k], 0, limits).astype(np.float32)
-                found.append(Detection(category, float(scores[k]), box, masks[k].copy()))
+                mask = NO_MASK if weak else masks[k].copy()
+                found.append(Detection(category, float(scores[k]), box, mask, weak))
         return tuple(found)
 
 
