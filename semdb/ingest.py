@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from semdb.database import items
@@ -22,10 +22,11 @@ from semdb.item_work import STAGES, Item, work_off
 from semdb.keyframes import select_keyframes
 from semdb.model_choice import ModelSpecs, settings_of_map, specs_for_ingest
 from semdb.perception.describe import Describer, describer_from_specs
-from semdb.recordings import open_recordings
+from semdb.recordings import open_recordings, parse_camera
 from semdb.recordings.base import DroppedFrame, FrameEntry, Recording
+from semdb.recordings.source import locate, write_source
 from semdb.settings import Settings
-from semdb.types import Camera, ModelInfo
+from semdb.types import ModelInfo
 
 Progress = Callable[[str, int, int], None]  # what, done, total
 MOST_DESCRIBERS = 4  # each holds networks of its own
@@ -36,14 +37,20 @@ SECONDS_BETWEEN_LOOKS = 0.5  # at what other workers still have
 class IngestOptions:
     """`keyframes` and `stride` as in `semdb.keyframes.select_keyframes`; `name` overrides the recording's own.
 
-    `map_name` None gives each recording the map of `default_map_name`.
+    `map_name` None gives each recording the map of `default_map_name`. `camera` is the text of ``--camera``;
+    `descriptor_dtype` is how descriptors of float are stored.
     """
 
     map_name: str | None = None
     name: str | None = None
     keyframes: int | None = None
     stride: int | None = None
-    camera: Camera | None = None
+    camera: str | None = None
+    descriptor_dtype: str = "float32"
+
+    def map_of(self, recording: Recording) -> str:
+        """The map that `recording` goes into."""
+        return self.map_name or default_map_name(recording)
 
 
 @dataclass(slots=True)
@@ -73,7 +80,7 @@ class IngestSummary:
 
 
 def ingest_recordings(
-    paths: Sequence[Path],
+    paths: Sequence[Path | str],
     settings: Settings,
     options: IngestOptions | None = None,
     *,
@@ -85,18 +92,13 @@ def ingest_recordings(
     `say` takes lines for people (what was chosen where nothing was set). Raises RecordingError for a path that
     cannot be used at all, UsageError when the models or the plan contradict what is stored, DatabaseError.
     """
-    options = options or IngestOptions()
-    recordings = [found for path in paths for found in open_recordings(path, options.camera)]
-    if options.name is not None:
-        if len(recordings) > 1:
-            raise UsageError(f"--name names one recording, but {len(recordings)} were found")
-        recordings[0].name = options.name
-    _check_names(recordings)
+    options = replace(options or IngestOptions(), descriptor_dtype=settings.descriptor_dtype)
+    recordings = open_all(paths, settings, options)
     describers: dict[object, list[Describer]] = {}
     summaries: list[IngestSummary] = []
     with open_store(settings.database_url, create=True) as store:
         for recording in recordings:
-            map_models = map_models_of(store, options.map_name or default_map_name(recording))
+            map_models = map_models_of(store, options.map_of(recording))
             specs = specs_for_ingest(settings, map_models, has_masks=recording.categories is not None)
             for note in (*recording.notes, *specs.notes):
                 (say or _nobody)(f"{recording.name}: {note}")
@@ -108,6 +110,26 @@ def ingest_recordings(
             summary.notes = (*recording.notes, *specs.notes)
             summaries.append(summary)
     return summaries
+
+
+def open_all(paths: Sequence[Path | str], settings: Settings, options: IngestOptions) -> list[Recording]:
+    """Every recording under `paths`, which are folders or URLs, under the names that they will have.
+
+    Raises RecordingError for a path that cannot be used, UsageError where names collide or one name is given to many.
+    """
+    camera = None if options.camera is None else parse_camera(options.camera)
+    recordings = []
+    for path in paths:
+        for recording in open_recordings(locate(str(path), settings), camera):
+            below = recording.path.name if recording.path.name != Path(str(path)).name else None
+            recording.source = write_source(str(path) if below is None else f"{path}/{below}", options.camera)
+            recordings.append(recording)
+    if options.name is not None:
+        if len(recordings) > 1:
+            raise UsageError(f"--name names one recording, but {len(recordings)} were found")
+        recordings[0].name = options.name
+    _check_names(recordings)
+    return recordings
 
 
 def make_describers(specs: ModelSpecs, settings: Settings) -> list[Describer]:
@@ -142,7 +164,9 @@ def ingest_recording(
     requeue_failed(store.engine, summary.recording_id)
     done = 0
     while True:
-        for item in work_off(recording, summary.recording_id, store, describers):
+        for item in work_off(
+            recording, summary.recording_id, store, describers, descriptor_dtype=options.descriptor_dtype
+        ):
             _count(summary, item)
             done += 1
             if progress is not None:
@@ -171,7 +195,7 @@ def plan_ingest(
     Returns a summary of which nothing is done yet, and how many keyframes are to be done. Raises as
     `Store.plan_recording` does.
     """
-    map_name = options.map_name or default_map_name(recording)
+    map_name = options.map_of(recording)
     check_models(map_models_of(store, map_name), models, f"the map {map_name!r}")
     if entries is None:
         entries = _planned_entries(recording, store, map_name, options, progress)
@@ -256,7 +280,7 @@ def _plan(
     plan = RecordingPlan(
         name=recording.name,
         format=recording.format,
-        source=str(recording.path.absolute()),
+        source=recording.source or str(recording.path.absolute()),
         frame_count=recording.total_frames,
         fingerprint=fingerprint(recording, entries),
         frame_indexes=tuple(entry.index for entry in entries),

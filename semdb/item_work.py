@@ -50,6 +50,7 @@ def work_off(
     frames: Sequence[int] | None = None,
     stop: Callable[[], bool] = lambda: False,
     lease_s: int = items.LEASE_S,
+    descriptor_dtype: str = "float32",
 ) -> Iterator[Item]:
     """Claims keyframes of `recording`, of `frames` where given, and stores them; yields each when it is done.
 
@@ -66,7 +67,7 @@ def work_off(
     stages = (
         Stage("read", lambda item: _read(recording, item)),
         Stage("describe", lambda item: _describe(idle, item), len(describers)),
-        Stage("store", lambda item: _store(store, recording_id, item)),
+        Stage("store", lambda item: _store(store, recording_id, item, descriptor_dtype)),
     )
     claimed = _claims(recording, recording_id, store, worker, batch, frames, stop, lease_s)
     with _Renewal(store, recording_id, worker, lease_s):
@@ -156,7 +157,7 @@ def _describe(idle: SimpleQueue[Describer], item: Item) -> Item:
     return item
 
 
-def _store(store: Store, recording_id: int, item: Item) -> Item:
+def _store(store: Store, recording_id: int, item: Item, descriptor_dtype: str = "float32") -> Item:
     started = time.perf_counter()
     frame, description = item.frame, item.description
     item.frame = item.description = None  # so that what waits to be taken note of holds no images
@@ -173,6 +174,7 @@ def _store(store: Store, recording_id: int, item: Item) -> Item:
         depth_scale=frame.depth_scale,
         depth_registration=frame.depth_registration,
         description=description,
+        descriptor_dtype=descriptor_dtype,
     )
     try:
         item.created = store.write_keyframe(recording_id, record, item.claim).created

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -42,5 +43,12 @@ class Settings(BaseSettings):
     )
     broker_url: str = Field(
         "redis://localhost:6379/0", description="broker of the workers, redis://HOST:PORT/N or another of Celery's"
+    )
+    log_format: Literal["text", "json"] = Field("text", description="json: each event is one line of JSON on stderr")
+    metrics_port: int | None = Field(
+        None, ge=1, le=65535, description="a worker serves Prometheus metrics on this port; default: not at all"
+    )
+    descriptor_dtype: Literal["float32", "float16"] = Field(
+        "float32", description="how descriptors of float are stored; float16 takes half the room"
     )
     sql_time_limit_s: float = Field(60.0, gt=0, description="time limit of `semdb sql`")

@@ -1,4 +1,4 @@
-"""The Celery application ``semdb.workers``: ``celery --app semdb.workers worker``. Thin over `semdb.ingest`.
+"""The Celery application ``semdb.workers``: ``celery --app semdb.workers worker``. Thin over `semdb.queueing`.
 
 The broker is the setting SEMDB_BROKER_URL. Messages say what to do, the database says what is done: a message may
 be lost or arrive twice, and running a task again adds nothing.
@@ -6,6 +6,7 @@ be lost or arrive twice, and running a task again adds nothing.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 try:
@@ -13,14 +14,24 @@ try:
 except ImportError as error:
     raise ImportError("semdb.workers needs the worker extra: pip install 'semdb[worker]'") from error
 
+from semdb.errors import SemdbError
 from semdb.settings import Settings
 
 INGEST_TASK = "semdb.ingest_recording"
+ITEMS_TASK = "semdb.ingest_items"
+SOFT_LIMIT_S = 600  # for the keyframes of one message
+HARD_LIMIT_S = SOFT_LIMIT_S + 60
+SOCKET_LIMITS = {"socket_timeout": 10, "socket_connect_timeout": 5}
+VISIBILITY_S = HARD_LIMIT_S + 240  # a message that nobody acknowledged for so long is given to another worker
+
+
+class BrokerError(SemdbError):
+    """The broker does not answer."""
 
 
 def make_app(settings: Settings) -> Any:
     """The Celery application for `settings`; its tasks are found by name when a worker starts."""
-    application = Celery("semdb", broker=settings.broker_url, include=["semdb.workers.tasks"])
+    application = Celery("semdb", broker=settings.broker_url, include=["semdb.workers.tasks", "semdb.workers.process"])
     application.conf.update(
         task_ignore_result=True,  # the database holds the outcome
         task_acks_late=True,  # a worker that dies gives its message back
@@ -29,10 +40,33 @@ def make_app(settings: Settings) -> Any:
         task_serializer="json",
         accept_content=["json"],
         broker_connection_retry_on_startup=True,
-        broker_transport_options={"visibility_timeout": 6 * 3600},  # longer than a recording takes
+        broker_connection_max_retries=None,  # a broker that is gone may come back
+        worker_cancel_long_running_tasks_on_connection_loss=False,  # they go on: only their message is lost
+        broker_transport_options={
+            "visibility_timeout": VISIBILITY_S,
+            "socket_timeout": 10,
+            "socket_connect_timeout": 5,
+        },
         task_default_queue="semdb",
+        worker_hijack_root_logger=False,
     )
     return application
 
 
 app = make_app(Settings())
+
+
+def send_items(recording_id: int, source: str, frames: Sequence[int]) -> None:
+    """Sends one message that names keyframes. Raises BrokerError: they stay planned, and a sweep sends them."""
+    from kombu.exceptions import OperationalError
+
+    try:
+        app.send_task(
+            ITEMS_TASK, args=[recording_id, source, list(frames)], retry=True, retry_policy={"max_retries": 3}
+        )
+    except (OperationalError, OSError) as error:
+        where = app.connection_for_write().as_uri()  # without the password
+        raise BrokerError(
+            f"the broker {where} does not answer ({error}); the plan is in the database: when the broker is back, run "
+            "`semdb ingest --resume`"
+        ) from error

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+import contextlib
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from importlib import import_module
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
@@ -11,12 +16,16 @@ from semdb.cli.options import CameraOption, JsonFlag, Overrides, settings_option
 
 if TYPE_CHECKING:
     from semdb.ingest import IngestSummary
+    from semdb.queueing import Send
+    from semdb.settings import Settings
 
 
 @settings_options(models=True)
 def command(
-    paths: Annotated[list[Path], typer.Argument(metavar="PATH...", help="Folders of recordings.")],
     overrides: Overrides,
+    paths: Annotated[
+        list[str] | None, typer.Argument(metavar="PATH...", help="Folders of recordings, or URLs such as s3://...")
+    ] = None,
     map_name: Annotated[
         str | None,
         typer.Option("--map", metavar="M", help="World frame that the recordings share; default: one map each."),
@@ -29,29 +38,91 @@ def command(
         int | None, typer.Option("--stride", metavar="N", help="Every N-th usable frame instead of a selection.")
     ] = None,
     camera: CameraOption = None,
+    queue: Annotated[
+        bool, typer.Option("--queue", help="Plan here, and let workers do it: see semdb.workers.")
+    ] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Without PATH: send all that is planned and not done to the workers again.")
+    ] = False,
     json: JsonFlag = False,
 ) -> None:
     """Select keyframes, describe them and store them. Running it again adds nothing; cut off, it goes on."""
     from semdb.cli.output import print_json
     from semdb.cli.progress import StagedProgress, say
+    from semdb.errors import UsageError
+    from semdb.events import log_to
     from semdb.ingest import IngestOptions, ingest_recordings
-    from semdb.recordings import parse_camera
+    from semdb.queueing import queue_recordings
 
-    options = IngestOptions(
-        map_name=map_name,
-        name=name,
-        keyframes=keyframes,
-        stride=stride,
-        camera=None if camera is None else parse_camera(camera),
-    )
-    with StagedProgress() as progress:
-        summaries = ingest_recordings(paths, overrides.settings(), options, progress=progress.update, say=say)
-    if json:
+    settings = overrides.settings()
+    if settings.log_format == "json":
+        log_to()
+    if resume and not paths:
+        _resume(settings)
+        return
+    if not paths:
+        raise UsageError("name the folder of a recording: semdb ingest PATH (or --resume for what workers have left)")
+    options = IngestOptions(map_name=map_name, name=name, keyframes=keyframes, stride=stride, camera=camera)
+    with StagedProgress() as progress, _terminable():
+        if queue:
+            summaries = queue_recordings(paths, settings, options, _send(), progress=progress.update, say=say)
+        else:
+            summaries = ingest_recordings(paths, settings, options, progress=progress.update, say=say)
+    if queue and not json:
+        print("\n".join(queued_text(summary) for summary in summaries))
+    elif json:
         print_json([as_json(summary) for summary in summaries])
     else:
         print("\n\n".join(as_text(summary) for summary in summaries))
     if any(summary.failed for summary in summaries):
         raise typer.Exit(1)
+
+
+def _send() -> Send:
+    """How keyframes are sent to workers. Raises UsageError without the worker extra."""
+    from semdb.errors import UsageError
+
+    try:
+        workers = import_module("semdb.workers")
+    except ImportError as error:
+        raise UsageError(str(error)) from error
+    return cast("Send", workers.send_items)
+
+
+def _resume(settings: Settings) -> None:
+    from semdb.database.store import open_store
+    from semdb.queueing import sweep
+
+    with open_store(settings.database_url) as store:
+        sent = sweep(store, _send(), all_pending=True)
+    print(f"sent {sent} keyframes to the workers" if sent else "nothing is left to send")
+
+
+@contextlib.contextmanager
+def _terminable() -> Iterator[None]:
+    """SIGTERM ends the command as Ctrl-C does: what is under way is finished, the rest given back; exit code 143."""
+
+    def end(_number: int, _frame: object) -> None:
+        print("semdb: terminated", file=sys.stderr)
+        raise SystemExit(128 + signal.SIGTERM)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def queued_text(summary: IngestSummary) -> str:
+    """What `--queue` prints for one recording."""
+    left = summary.planned - summary.already_stored
+    return (
+        f"{summary.map_name}/{summary.recording}: {summary.planned} keyframes planned, {summary.already_stored} "
+        f"stored, {left} left to the workers; watch them: semdb status --watch"
+    )
 
 
 def as_json(summary: IngestSummary) -> dict[str, object]:
@@ -65,13 +136,14 @@ def as_json(summary: IngestSummary) -> dict[str, object]:
         "keyframes": summary.planned,
         "already_stored": summary.already_stored,
         "stored": summary.stored,
+        "stored_elsewhere": summary.elsewhere,
         "failed": {str(index): reason for index, reason in summary.failed.items()},
         "objects": summary.objects,
         "keypoints": summary.keypoints,
         "dropped": [{"name": dropped.name, "reason": dropped.reason} for dropped in summary.dropped],
         "models": {model.role: model.name for model in summary.models},
         "notes": list(summary.notes),
-        "seconds": summary.seconds,
+        "seconds": summary.seconds or None,
     }
 
 
@@ -87,7 +159,7 @@ def as_text(summary: IngestSummary) -> str:
         f"frames     {summary.total_frames}, usable {summary.usable_frames}, dropped {len(summary.dropped)}",
         *(f"           {line}" for line in group_dropped(summary.dropped)),
         f"keyframes  {summary.planned} planned, {summary.stored} stored now, {summary.already_stored} stored before"
-        f", {len(summary.failed)} failed",
+        f", {len(summary.failed)} failed" + (f", {summary.elsewhere} by other processes" if summary.elsewhere else ""),
         *(f"           frame {index}: {reason}" for index, reason in summary.failed.items()),
         f"objects    {summary.objects} with {summary.keypoints} keypoints in all",
         f"models     {', '.join(model.name for model in summary.models)}",

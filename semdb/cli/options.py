@@ -81,6 +81,10 @@ class Overrides:
     def settings(self) -> Settings:
         """Settings of the environment under these options. Raises `UsageError` naming the variable or option."""
         given = {field.name: getattr(self, field.name) for field in fields(self)}
+        if self.database_url is not None:
+            from semdb.cli.secrets import hide_password
+
+            hide_password(self.database_url)
         return load_settings(**{name: value for name, value in given.items() if value is not None})
 
 

@@ -34,18 +34,58 @@ def command(
     from semdb.cli.output import print_json
     from semdb.database.store import open_store
 
+    rates = Rates()
     with open_store(overrides.settings().database_url) as store:
         while True:
             recordings, failed = look(store, map_name)
+            rates.look({recording.recording_id: recording.keyframes for recording in recordings})
             if json:
                 print_json([as_json(recording, failed) for recording in recordings])
             else:
                 if watch and sys.stdout.isatty():
                     print("\033[2J\033[H", end="")  # clear, cursor to the top left
                 show(store, recordings, failed)
+                if watch:
+                    show_work(store, recordings, rates)
             if not watch or all(recording.state == "complete" for recording in recordings):
                 return
             time.sleep(SECONDS_BETWEEN_LOOKS)
+
+
+class Rates:
+    """Keyframes per second of each recording over the last looks."""
+
+    def __init__(self, window_s: float = 30.0) -> None:
+        self._window_s = window_s
+        self._looks: list[tuple[float, dict[int, int]]] = []
+
+    def look(self, counts: dict[int, int], now_s: float | None = None) -> None:
+        """Takes note of the keyframes stored of each recording."""
+        now_s = time.monotonic() if now_s is None else now_s
+        self._looks = [look for look in self._looks if look[0] >= now_s - self._window_s] + [(now_s, counts)]
+
+    def per_second(self, recording_id: int) -> float | None:
+        """None until there are two looks at the recording."""
+        (first_s, first), (last_s, last) = self._looks[0], self._looks[-1]
+        if last_s <= first_s or recording_id not in first:
+            return None
+        return (last.get(recording_id, 0) - first[recording_id]) / (last_s - first_s)
+
+
+def show_work(store: Store, recordings: list[RecordingStatus], rates: Rates) -> None:
+    """Print rates and the time left of recordings that are not complete, and who works on them."""
+    from semdb.cli.progress import format_duration
+    from semdb.database.reporting import workers
+
+    for recording in recordings:
+        rate = rates.per_second(recording.recording_id)
+        left = sum(recording.items.get(state, 0) for state in ("pending", "running"))
+        if left and rate is not None:
+            time_left = f", {format_duration(left / rate)} left" if rate > 0 else ""
+            print(f"{recording.map}/{recording.name}: {left} to do, {rate:.1f} keyframes/s{time_left}")
+    for worker in workers(store.engine):
+        late = " (its lease has run out)" if worker.seconds_left < 0 else ""
+        print(f"worker {worker.machine} process {worker.process}: {worker.items} keyframes in hand{late}")
 
 
 def look(store: Store, map_name: str | None) -> tuple[list[RecordingStatus], list[FailedItem]]:
@@ -127,5 +167,7 @@ def retry(overrides: Overrides, map_name: MapName = None) -> None:
             total += number
             if number:
                 print(f"{recording.map}/{recording.name}: {number} put back; run: semdb ingest {recording.source}")
-    if not total:
+    if total:
+        print("or, where workers do it: semdb ingest --resume")
+    else:
         print("nothing has failed")

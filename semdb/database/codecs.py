@@ -31,12 +31,13 @@ _DTYPES: dict[int, np.dtype[Any]] = {
     3: np.dtype("<f8"),
     4: np.dtype("<i4"),
     5: np.dtype("<u4"),
+    6: np.dtype("<f2"),
 }
 _CODES = {dtype: code for code, dtype in _DTYPES.items()}
 
 
 def encode_array(array: npt.NDArray[Any], *, magic: bytes = ARRAY_MAGIC) -> bytes:
-    """`array` as a blob. Raises CodecError for a dtype that has no code (float32, uint8, float64, int32, uint32)."""
+    """`array` as a blob. Raises CodecError for a dtype that has no code (float16 to float64, uint8, int32, uint32)."""
     dtype = array.dtype.newbyteorder("<")
     code = _CODES.get(dtype)
     if code is None or array.ndim > 8:
@@ -143,6 +144,8 @@ def decode_keypoints(
     count = len(packed)
     if descriptors is None:
         descriptors = np.empty((count, 0), dtype=np.float32)
+    if descriptors.dtype == np.float16:  # how they are stored; they are compared as float32
+        descriptors = descriptors.astype(np.float32)
     if descriptors.ndim != 2 or len(descriptors) != count or len(object_index) != count:
         raise CodecError(
             f"{where}: {count} keypoints, descriptors {descriptors.shape}, {len(object_index)} in object slices"

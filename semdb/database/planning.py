@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import Connection, Engine, Row, func, insert, select, update
@@ -116,6 +117,31 @@ def plan_recording(
         except IntegrityError:
             continue
     raise DatabaseError(f"the recording {plan.name!r} could not be planned; try again")
+
+
+@dataclass(frozen=True, slots=True)
+class StoredPlan:
+    """The plan of a recording as it is in the database."""
+
+    recording_id: int
+    map_id: int
+    source: str
+    fingerprint: str
+    frame_indexes: tuple[int, ...]  # ascending, those of deleted keyframes too
+
+
+def stored_plan(engine: Engine, recording_id: int) -> StoredPlan:
+    """The plan of a recording. Raises NotFoundError for one that is not there, or is being deleted."""
+
+    def work(connection: Connection) -> StoredPlan:
+        row = connection.execute(select(recordings).where(recordings.c.id == recording_id)).one_or_none()
+        if row is None or row.state == RecordingState.DELETING:
+            raise NotFoundError(f"there is no recording with the id {recording_id}")
+        query = select(ingest_items.c.frame_index).where(ingest_items.c.recording_id == recording_id)
+        indexes = connection.execute(query.order_by(ingest_items.c.frame_index)).scalars()
+        return StoredPlan(row.id, row.map_id, row.source, row.fingerprint, tuple(int(index) for index in indexes))
+
+    return retry.read(engine, work)
 
 
 def _check_plan(plan: RecordingPlan, infos: Sequence[ModelInfo]) -> None:

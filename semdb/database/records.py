@@ -76,6 +76,7 @@ class KeyframeRecord:
     depth_scale: float | None
     depth_registration: str
     description: Description
+    descriptor_dtype: str = "float32"  # of descriptors of float: "float16" takes half the room
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
+from datetime import datetime
 from typing import Any
 
 from sqlalchemy import Connection, Engine, FromClause, func, insert, select
 
 from semdb.database import retry
-from semdb.database.records import RecordingState, RecordingStatus
+from semdb.database.clock import now_plus
+from semdb.database.records import ItemState, RecordingState, RecordingStatus
 from semdb.database.tables import (
     ingest_items,
     keyframe_images,
@@ -62,6 +65,38 @@ def status(engine: Engine, map_id: int | None = None) -> list[RecordingStatus]:
         ]
 
     return retry.read(engine, work)
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerStatus:
+    """A worker with keyframes in hand. `seconds_left` of its shortest lease, by the database's clock."""
+
+    machine: str
+    process: str
+    items: int
+    seconds_left: float
+
+
+def workers(engine: Engine) -> list[WorkerStatus]:
+    """Who works on keyframes now, by name."""
+    item = ingest_items.c
+    query = (
+        select(item.worker, func.count(), func.min(item.lease_until), now_plus())
+        .where(item.state == ItemState.RUNNING.value, item.worker.is_not(None))
+        .group_by(item.worker)
+        .order_by(item.worker)
+    )
+    found = []
+    for name, count, until, now in retry.read(engine, lambda c: list(c.execute(query))):
+        parts = f"{name}!!!".split("!")
+        left = (_as_time(until) - _as_time(now)).total_seconds() if until is not None else 0.0
+        found.append(WorkerStatus(parts[0], parts[2], int(count), left))
+    return found
+
+
+def _as_time(value: Any) -> datetime:
+    """SQLite gives the text of a time that a function made."""
+    return value if isinstance(value, datetime) else datetime.fromisoformat(str(value))
 
 
 def _sums(connection: Connection, map_id: int | None, value: Any, table: Any = None) -> dict[int, int]:

@@ -23,6 +23,7 @@ from semdb.errors import DatabaseError, DatabaseUnavailableError, RecordingUnava
 
 T = TypeVar("T")
 _answered: WeakSet[Engine] = WeakSet()  # engines that have had a connection
+listeners: list[Callable[[], None]] = []  # told of each transaction that is run again
 ATTEMPTS = 10
 FIRST_DELAY_S = 0.05
 LONGEST_DELAY_S = 3.0
@@ -74,6 +75,8 @@ def _run(engine: Engine, work: Callable[[Connection], T], *, write: bool) -> T:
             raise explain(engine, error) from error
         if attempt == ATTEMPTS:
             raise explain(engine, failure, attempts=ATTEMPTS) from failure
+        for listener in listeners:
+            listener()
         time.sleep(delay * random.uniform(0.5, 1.0))
         delay = min(delay * 2, LONGEST_DELAY_S)
     raise AssertionError("unreachable")

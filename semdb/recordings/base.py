@@ -83,6 +83,7 @@ class Recording:
     notes: tuple[str, ...] = ()
     depth_registration: str = ""
     categories: Mapping[int, str] | None = None
+    source: str = ""  # what the database keeps of where it came from; "": the folder
     decode_failures: list[DroppedFrame] = field(default_factory=list)
 
     def read(self, entry: FrameEntry) -> Frame:

@@ -99,4 +99,5 @@ def test_the_worker_application_is_importable(clean_python: Path, environment: d
     code = (
         "from semdb.workers import app; import semdb.workers.tasks; print(sorted(t for t in app.tasks if 'semdb' in t))"
     )
-    assert run(clean_python, "-c", code, cwd=tmp_path, env=environment).strip() == "['semdb.ingest_recording']"
+    found = run(clean_python, "-c", code, cwd=tmp_path, env=environment).strip()
+    assert found == "['semdb.ingest_items', 'semdb.ingest_recording']"

@@ -1,0 +1,116 @@
+"""Where a recording is: a folder, or an address of a file system that fsspec knows, and how it is written down.
+
+An address (``s3://bucket/room``, ``memory://room``, ``file:///data/room``) is copied file by file into the cache folder
+before it is read; files that are there with the right size are not fetched again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import secrets
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from semdb.errors import RecordingError, RecordingUnavailableError, UsageError
+from semdb.recordings.cameras import parse_camera
+from semdb.settings import Settings
+from semdb.types import Camera
+
+_ADDRESS = re.compile(r"[a-z][a-z0-9+.-]*://")
+_CAMERA = "?camera="
+FETCHERS = 8  # files that are fetched at a time
+
+
+def is_address(path: str) -> bool:
+    """Whether `path` is a URL, not a folder of this machine."""
+    return _ADDRESS.match(path) is not None
+
+
+def write_source(address: str, camera: str | None) -> str:
+    """What the database keeps: the absolute folder or the URL, and the camera where one was given by hand."""
+    where = address if is_address(address) else str(Path(address).absolute())
+    return where if camera is None else f"{where}{_CAMERA}{camera}"
+
+
+def parse_source(source: str) -> tuple[str, Camera | None]:
+    """The folder or URL, and the camera, of `write_source`."""
+    where, found, camera = source.partition(_CAMERA)
+    return where, parse_camera(camera) if found else None
+
+
+def locate(address: str, settings: Settings) -> Path:
+    """The folder on this machine: `address` itself, or the copy of a URL, brought up to date.
+
+    Raises UsageError where fsspec, or what it needs for this kind of URL, is not installed, RecordingError for a URL
+    with nothing under it, RecordingUnavailableError when it cannot be reached.
+    """
+    if not is_address(address):
+        return Path(address)
+    return fetch(address, settings.cache_dir.expanduser() / "recordings")
+
+
+def fetch(address: str, cache: Path) -> Path:
+    """Copies all files under the URL `address` into a folder of `cache`, which it returns; see `locate`."""
+    system, root = _file_system(address)
+    try:
+        listing = system.find(root, detail=True)
+    except FileNotFoundError as error:
+        raise RecordingError(f"{address}: there is nothing there") from error
+    except Exception as error:  # each file system has errors of its own
+        raise _unavailable(address, error) from error
+    if not listing:
+        raise RecordingError(f"{address}: there is nothing there")
+    name = address.rstrip("/").rsplit("/", 1)[-1] or "recording"
+    folder = cache / hashlib.sha256(address.rstrip("/").encode()).hexdigest()[:16] / name
+    prefix = str(root).rstrip("/") + "/"
+    wanted = []
+    for remote, info in listing.items():
+        relative = str(remote).removeprefix(prefix)
+        target = folder / relative
+        if not target.resolve().is_relative_to(folder.resolve()):
+            raise RecordingError(f"{address}: has a file of the impossible name {relative!r}")
+        if not _is_there(target, info):
+            wanted.append((str(remote), target))
+    try:
+        with ThreadPoolExecutor(FETCHERS) as pool:
+            for done in [pool.submit(_fetch_file, system, remote, target) for remote, target in wanted]:
+                done.result()
+    except Exception as error:
+        raise _unavailable(address, error) from error
+    return folder
+
+
+def _file_system(address: str) -> tuple[Any, str]:
+    try:
+        import fsspec
+    except ImportError as error:
+        raise UsageError(f"{address}: URLs need the remote extra: pip install 'semdb[remote]'") from error
+    try:
+        system, root = fsspec.core.url_to_fs(address)
+    except (ImportError, ValueError) as error:
+        raise UsageError(f"{address}: {error}") from error
+    return system, str(root)
+
+
+def _is_there(target: Path, info: dict[str, Any]) -> bool:
+    """A copy of the same size. Lists are small and may grow or change in place: they are always fetched."""
+    if target.suffix.lower() not in (".png", ".jpg", ".jpeg") or not target.is_file():
+        return False
+    return target.stat().st_size == info.get("size")
+
+
+def _fetch_file(system: Any, remote: str, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    part = target.with_name(f".{target.name}.{os.getpid()}.{secrets.token_hex(4)}")
+    try:
+        part.write_bytes(system.cat_file(remote))
+        part.replace(target)  # whole, or not at all: several workers may fetch it
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _unavailable(address: str, error: Exception) -> RecordingUnavailableError:
+    return RecordingUnavailableError(f"{address}: cannot be read now ({type(error).__name__}: {error})")
