@@ -76,15 +76,18 @@ def measure(url: str, size: int, world: World, seconds: float) -> dict[str, Any]
         with MapIndex.open(
             store, MAP_ID, cache, options=options, say=lambda line: print(line, file=sys.stderr)
         ) as index:
-            contestants = {
-                "naive SQL": methods.NaiveSql(store),
-                "SQL": methods.Source(SqlSource(store, MAP_ID)),
-                "index": methods.Source(IndexSource(index)),
+            sql, memory = methods.Source(SqlSource(store, MAP_ID)), methods.Source(IndexSource(index))
+            filters = {
+                "naive SQL": methods.NaiveSql(store).filtered,
+                "SQL": sql.filtered,
+                "index": memory.filtered,
+                "SQL, by strengths": sql.filtered_by_strength,
+                "index, by strengths": memory.filtered_by_strength,
             }
-            filtered = {name: run(method.filtered, queries, seconds) for name, method in contestants.items()}
+            filtered = {name: run(method, queries, seconds) for name, method in filters.items()}
             with Progress("the exact ranking", "keyframes") as progress:
                 exact = methods.exact_ten(store, queries, progress)
-            whole = {"index": run(contestants["index"].whole, queries, seconds)}
+            whole = {"index": run(memory.whole, queries, seconds)}
             whole.update(peers(store, queries, size, seconds))
             found = time_to_find(url, index, world.seed)
     return {
@@ -143,7 +146,10 @@ def time_to_find(url: str, index: MapIndex, seed: int) -> list[float]:
         for _ in range(NEWS):
             writer.stdin.write("next\n")
             writer.stdin.flush()
-            news = json.loads(writer.stdout.readline())
+            line = writer.stdout.readline()
+            if not line:
+                raise SystemExit("bench.coarse: the process that writes keyframes failed, see above")
+            news = json.loads(line)
             vector = np.array(news["vector"], np.float32)
             while True:
                 source.refresh()
@@ -168,9 +174,9 @@ def percentiles(milliseconds: list[float]) -> dict[str, float]:
 
 def summarise_filter(results: dict[str, tuple[list[float], list[list[int]]]]) -> dict[str, Any]:
     """Times, and the share of queries with the same first ten, in the same order, as semdb's SQL."""
-    reference = results["SQL"][1]
     summary: dict[str, Any] = {}
     for name, (milliseconds, answers) in results.items():
+        reference = results["SQL, by strengths" if "strengths" in name else "SQL"][1]
         pairs = list(zip(answers, reference, strict=False))
         summary[name] = {**percentiles(milliseconds), "same_ten": float(np.mean([a == b for a, b in pairs]))}
     for name in results:

@@ -14,6 +14,7 @@ import pymysql
 from sqlalchemy import insert
 
 from bench.coarse_world import CATEGORIES, LENGTH, World
+from semdb.class_score import MOST_OBJECTS, UNITS
 from semdb.cli.progress import Progress
 from semdb.database import schema, tables
 from semdb.database.codecs import encode_array, encode_mask
@@ -23,6 +24,7 @@ from semdb.types import Camera, ModelInfo
 from tests.mariadb import TestServer
 
 MAP = "made-up"
+VERSION = 2  # of what is filled in: a kept server that holds another one is filled anew
 MODELS = (
     ModelInfo("detector", "made-up", "", "{}"),
     ModelInfo("encoder", "made-up", "", "{}"),
@@ -42,13 +44,15 @@ def fill(server: TestServer, keyframes: int, world: World) -> str:
     recordings, rest = divmod(keyframes, LENGTH)
     if rest or not recordings:
         raise SystemExit(f"bench.coarse: {keyframes} keyframes are not a multiple of {LENGTH}")
-    name = f"semdb_coarse_{keyframes}_{world.seed}"
+    name = f"semdb_coarse_{keyframes}_{world.seed}_v{VERSION}"
     url = server.admin.set(database=name).render_as_string(hide_password=False)
     with contextlib.closing(_connect(server)) as connection, connection.cursor() as cursor:
         if _is_filled(cursor, name):
             _upgrade(url)
             return url
-        cursor.execute(f"DROP DATABASE IF EXISTS `{name}`")
+        cursor.execute("SHOW DATABASES LIKE %s", (name.partition("_v")[0].replace("_", "\\_") + "%",))
+        for (other,) in cursor.fetchall():  # of another version, or not filled to the end
+            cursor.execute(f"DROP DATABASE `{other}`")
         cursor.execute(f"CREATE DATABASE `{name}` CHARACTER SET utf8mb4 COLLATE utf8mb4_bin")
         _upgrade(url)
         engine = make_engine(url)
@@ -158,20 +162,30 @@ def _changes(world: World, number: int) -> bytes:
 
 
 def _objects(world: World, number: int) -> bytes:
-    keyframe, category = world.objects(world.trajectory(number))
-    starts = np.searchsorted(keyframe, np.arange(LENGTH))
-    ordinal = np.arange(len(keyframe)) - starts[keyframe]
-    score = np.random.default_rng([world.seed, 6, number]).uniform(0.5, 1, len(keyframe)).round(4)
-    columns = (x.tolist() for x in (keyframe + _first_id(number), ordinal, category + 1, score))
-    rest = f"{DETECTOR}\t100\t100\t199\t199\t10000\t".encode() + _escape(MASK) + b"\n"
-    return b"".join(f"{k}\t{o}\t{c}\t{s}\t".encode() + rest for k, o, c, s in zip(*columns, strict=True))
+    seen = world.seen(number)
+    starts = np.searchsorted(seen.keyframe, np.arange(LENGTH))
+    ordinal = np.arange(len(seen.keyframe)) - starts[seen.keyframe]
+    top = CAMERA.height // 2 + 15 * seen.height - 50  # 15 pixels are a 32nd of the image
+    values = (seen.keyframe + _first_id(number), ordinal, seen.category + 1, seen.score, top, top + 99)
+    rest = f"{DETECTOR}\t100\t199\t10000\t".encode() + _escape(MASK) + b"\n"
+    rows = zip(*(column.tolist() for column in values), strict=True)
+    return b"".join("".join(f"{value}\t" for value in row).encode() + rest for row in rows)
 
 
 def _keyframe_categories(world: World, number: int) -> bytes:
-    keyframe, category = world.objects(world.trajectory(number))
-    pairs, counts = np.unique(np.stack([keyframe, category]), axis=1, return_counts=True)
-    columns = zip((pairs[0] + _first_id(number)).tolist(), (pairs[1] + 1).tolist(), counts.tolist(), strict=True)
-    return _text((c, k, DETECTOR, MAP_ID, count) for k, c, count in columns)
+    """One row per keyframe and class, with the strengths that `semdb.class_score.strengths` gives."""
+    seen = world.seen(number)
+    keys, group, counts = np.unique(
+        seen.keyframe * len(CATEGORIES) + seen.category, return_inverse=True, return_counts=True
+    )
+    keyframe, category = np.divmod(keys, len(CATEGORIES))
+    above = 0.5 - seen.height / 16
+    parts = [np.bincount(group, seen.score * share, len(keys)) for share in (above, 1 - above)]
+    upper, lower = (np.minimum(MOST_OBJECTS, np.rint(UNITS * part)).astype(int) for part in parts)
+    held = np.bincount(keyframe, upper + lower, LENGTH).astype(int)[keyframe]
+    values = (category + 1, keyframe + _first_id(number), counts, upper, lower, held)
+    rows = zip(*(column.tolist() for column in values), strict=True)
+    return _text((*row, DETECTOR, MAP_ID) for row in rows)
 
 
 def _vectors(world: World, number: int) -> bytes:
@@ -190,7 +204,10 @@ LOADS: dict[str, tuple[str, Lines]] = {
     "recordings": ("id, map_id, name, format, source, fingerprint, frame_count, state", _recordings),
     "keyframes": ("id, recording_id, frame_index, timestamp_ns, camera_id, qw, qx, qy, qz, tx, ty, tz", _keyframes),
     "keyframe_changes": ("id, map_id, keyframe_id, kind", _changes),
-    "objects": ("keyframe_id, ordinal, category_id, score, model_id, x1, y1, x2, y2, pixel_area, mask", _objects),
-    "keyframe_categories": ("category_id, keyframe_id, model_id, map_id, count", _keyframe_categories),
+    "objects": ("keyframe_id, ordinal, category_id, score, y1, y2, model_id, x1, x2, pixel_area, mask", _objects),
+    "keyframe_categories": (
+        "category_id, keyframe_id, count, upper_strength, lower_strength, keyframe_strength, model_id, map_id",
+        _keyframe_categories,
+    ),
     "cnn_vectors": ("keyframe_id, model_id, vector", _vectors),
 }

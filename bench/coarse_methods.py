@@ -8,27 +8,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from sqlalchemy import bindparam, text
 
 from bench.coarse_fill import MAP_ID
 from bench.coarse_world import Query
-from semdb.class_score import ClassQuery, class_query
+from semdb.class_score import ClassQuery, class_query, strength_query
 from semdb.database.codecs import decode_vectors
 from semdb.database.store import Store
 from semdb.localization.coarse import CoarseSource
 from semdb.localization.ranking import best_first, exact_cosines
 
-FIRST, SHARE, AT_MOST = 10, 0.5, 1000
-
-
-class Filter(Protocol):
-    """A method for the first task."""
-
-    def filtered(self, query: Query) -> list[int]:
-        """Ids of the first ten."""
+FIRST, SHARE, STRONG, AT_MOST = 10, 0.5, 0.2, 1000
 
 
 class NaiveSql:
@@ -104,10 +97,22 @@ class Source:
         source.refresh()
 
     def filtered(self, query: Query) -> list[int]:
+        """By counts of objects."""
         source = self._source
         source.refresh()
-        classes = class_query(query.counts, source.keyframe_count(), source.document_frequencies(query.counts))
-        ids = source.filtered(classes, SHARE, AT_MOST).keyframe_ids
+        frequencies = source.document_frequencies(query.counts)
+        return self._ranked(query, class_query(query.counts, source.keyframe_count(), frequencies), SHARE)
+
+    def filtered_by_strength(self, query: Query) -> list[int]:
+        """By strengths, which only semdb has."""
+        source = self._source
+        source.refresh()
+        frequencies = source.document_frequencies(query.strengths)
+        return self._ranked(query, strength_query(query.strengths, source.keyframe_count(), frequencies), STRONG)
+
+    def _ranked(self, query: Query, classes: ClassQuery, share: float) -> list[int]:
+        source = self._source
+        ids = source.filtered(classes, share, AT_MOST).keyframe_ids
         cosines = source.cosines(query.vector, ids)
         return [int(i) for i in ids[best_first(ids, cosines, FIRST)]]
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from semdb.class_score import strengths
 from semdb.perception.detectors.coco import COCO_91, NO_OBJECT
 
 LENGTH = 1000  # keyframes of a recording
@@ -31,15 +32,27 @@ class Trajectory:
 
     latent: np.ndarray
     category: np.ndarray  # [k] position in CATEGORIES
+    height: np.ndarray  # [k] of the centre in the image: -8 at a quarter of it, 8 at three quarters
     first: np.ndarray
     last: np.ndarray
 
 
 @dataclass(frozen=True)
+class Seen:
+    """All that the keyframes of a recording show, by keyframe (0 to LENGTH - 1), then category; arrays ``[n]``."""
+
+    keyframe: np.ndarray
+    category: np.ndarray
+    height: np.ndarray
+    score: np.ndarray  # multiples of 1/64, so that sums are exact in any order
+
+
+@dataclass(frozen=True)
 class Query:
-    """Objects per class, and the unit vector float32 ``[SIZE]``, of an image that is no keyframe."""
+    """An image that is no keyframe: objects per class, their strengths, and a unit vector float32 ``[SIZE]``."""
 
     counts: dict[str, float]
+    strengths: dict[str, tuple[int, int]]
     vector: np.ndarray
 
 
@@ -72,7 +85,9 @@ class World:
         category = rng.choice(len(CATEGORIES), total, p=furniture / furniture.sum())
         first = rng.integers(-int(FRAMES_IN_VIEW), LENGTH, total)
         last = first + rng.geometric(1 / FRAMES_IN_VIEW, total)
-        return Trajectory(walk.astype(np.float32), category, np.clip(first, 0, LENGTH), np.clip(last, 0, LENGTH))
+        height = rng.integers(-8, 9, total)
+        first, last = np.clip(first, 0, LENGTH), np.clip(last, 0, LENGTH)
+        return Trajectory(walk.astype(np.float32), category, height, first, last)
 
     def vectors(self, latent: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Unit vectors float32 ``[n, SIZE]`` of points ``[n, LATENT]``; `rng` draws what differs between two looks."""
@@ -86,14 +101,17 @@ class World:
         """Vectors float32 ``[LENGTH, SIZE]`` of the keyframes of the recording `number`."""
         return self.vectors(self.trajectory(number).latent, np.random.default_rng([self.seed, 3, number]))
 
-    def objects(self, trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
-        """Keyframe (0 to LENGTH - 1, ascending) and category of every object that every keyframe sees."""
-        seen = trajectory.last - trajectory.first
-        start = np.repeat(trajectory.first, seen)
-        offset = np.arange(seen.sum()) - np.repeat(np.cumsum(seen) - seen, seen)
-        keyframe, category = start + offset, np.repeat(trajectory.category, seen)
+    def seen(self, number: int) -> Seen:
+        """What the keyframes of the recording `number` show."""
+        trajectory = self.trajectory(number)
+        frames = trajectory.last - trajectory.first
+        start = np.repeat(trajectory.first, frames)
+        offset = np.arange(frames.sum()) - np.repeat(np.cumsum(frames) - frames, frames)
+        keyframe = start + offset
+        category, height = np.repeat(trajectory.category, frames), np.repeat(trajectory.height, frames)
         order = np.lexsort((category, keyframe))
-        return keyframe[order], category[order]
+        score = np.random.default_rng([self.seed, 6, number]).integers(32, 65, len(order)) / 64
+        return Seen(keyframe[order], category[order], height[order], score)
 
     def queries(self, recordings: int, number: int) -> list[Query]:
         """Looks from between two keyframes, with a detector that misses every eighth object and invents some."""
@@ -102,14 +120,18 @@ class World:
         while len(queries) < number:
             trajectory = self.trajectory(int(rng.integers(recordings)))
             at = int(rng.integers(LENGTH - 1))
-            seen = trajectory.category[(trajectory.first <= at) & (at < trajectory.last)]
-            seen = seen[rng.random(len(seen)) > 0.125]
-            seen = np.concatenate([seen, rng.choice(len(CATEGORIES), rng.poisson(0.3), p=self.zipf)])
-            if not len(seen):
+            there = np.flatnonzero((trajectory.first <= at) & (at < trajectory.last))
+            there = there[rng.random(len(there)) > 0.125]
+            invented = rng.choice(len(CATEGORIES), rng.poisson(0.3), p=self.zipf)
+            category = np.concatenate([trajectory.category[there], invented])
+            if not len(category):
                 continue  # nothing to filter by
             middle = trajectory.latent[at : at + 2].mean(axis=0, keepdims=True)
             middle += rng.normal(0, STEP / np.sqrt(LATENT), LATENT).astype(np.float32)
-            names, counts = np.unique(seen, return_counts=True)
-            found = {CATEGORIES[k]: float(count) for k, count in zip(names, counts, strict=True)}
-            queries.append(Query(found, self.vectors(middle, rng)[0]))
+            vector = self.vectors(middle, rng)[0]
+            height = np.concatenate([trajectory.height[there], rng.integers(-8, 9, len(invented))])
+            scores = rng.uniform(0.5, 1, len(category))
+            names = [CATEGORIES[k] for k in category]
+            found = strengths(zip(names, scores.tolist(), (0.5 + height / 32).tolist(), strict=True))
+            queries.append(Query({name: float(names.count(name)) for name in sorted(names)}, found, vector))
         return queries
