@@ -22,6 +22,11 @@ from semdb.types import Float32Array, FloatArray, IntArray
 CAUCHY_SQUARED = 4.0  # (2 sigma)^2: where the loss leaves the parabola
 QUERY = 0  # index of the query among the images
 EVIDENCE_ROUNDS = 30
+FIRST_ITERATIONS = 4  # before the variances of the priors are known
+LEAST_GAIN = 1e-3  # of the cost; smaller ones move the pose by less than a tenth of its error
+LEAST_STEP = 2e-5  # m and rad, of the query
+NORMAL_MEDIAN = 1.4826  # a normal distribution's standard deviation over its median distance
+IGNORED = 1e6  # times the noise: no weight
 FIXED = 1e-7  # a standard deviation (m, rad) that nothing moves
 
 
@@ -103,7 +108,8 @@ class _Solver:
 
     def __init__(self, problem: BundleProblem) -> None:
         self.problem = problem
-        self.observed = np.column_stack([problem.xy, problem.sigma, problem.depth, problem.rows])
+        ones = np.ones(len(problem.xy))
+        self.observed = np.column_stack([problem.xy, problem.sigma, problem.depth, problem.rows, ones])
         bounds = np.arange(len(problem.points) + 1)
         self.first = np.searchsorted(problem.observed_point, bounds).astype(np.int32)
         self.images = len(problem.keyframe_from_world) + 1
@@ -129,6 +135,20 @@ class _Solver:
         blocks.image_gradients += self.information * offset
         blocks.cost += float((self.information * offset**2).sum())
         return blocks
+
+    def believe_depth(self, state: _State) -> None:
+        """Grows the noise of an image's depth where it disagrees with the rest by more than the sensor's noise.
+
+        As where depth and colour were taken at different times. The factor is the square of the excess: such errors
+        are larger than the noise, and as they are alike in neighbouring pixels, they do not average out either.
+        """
+        for image in range(self.images):
+            rows = np.flatnonzero((self.problem.observed_image == image) & np.isfinite(self.problem.depth))
+            if len(rows):
+                pose, depth = state.poses[image], self.problem.depth[rows]
+                z = state.points[self.problem.observed_point[rows]] @ pose[2, :3] + pose[2, 3]
+                excess = np.median(np.abs(z - depth) / _depth_sigma(depth)) * NORMAL_MEDIAN
+                self.observed[rows, 5] = max(1.0, float(excess)) ** 2
 
     def reduced(self, blocks: _Blocks, damping: float) -> tuple[FloatArray, FloatArray]:
         """Equations ``[9c, 9c]`` and gradient ``[9c]`` of the images with the points eliminated."""
@@ -169,13 +189,19 @@ class _Solver:
                 gain = blocks.cost - found.cost
                 state, blocks = proposed, found
                 damping = max(damping / 10, 1e-9)
-                if gain < 1e-5 * blocks.cost or np.abs(step[QUERY]).max() < 1e-7:
+                if gain < LEAST_GAIN * blocks.cost or np.abs(step[QUERY]).max() < LEAST_STEP:
                     break
             else:
                 damping *= 10
                 if damping > 1e6:
                     break
         return state, blocks, iteration
+
+
+def _depth_sigma(depth: FloatArray) -> FloatArray:
+    from semdb.localization.bundle_kernels import depth_sigma
+
+    return np.asarray(depth_sigma(depth))  # type: ignore[arg-type]  # compiled: takes arrays too
 
 
 def _move(pose: FloatArray, step: FloatArray) -> FloatArray:
@@ -194,6 +220,7 @@ def adjust(
     It is solved twice. First the images may turn and the keyframes move as far as `prior` believes at most; then
     the variance of each of these priors is what the solution shows it to be (MacKay's evidence approximation, Neural
     Computation 4(3), 1992). So where nothing turned, no freedom is given that noise would use.
+    The query's depth joins the second time, as far as it agrees with the first solution.
     Raises numpy.linalg.LinAlgError when the points do not determine the pose (fewer than three, or in a row).
     """
     prior = prior or MotionPrior()
@@ -204,7 +231,9 @@ def adjust(
     greatest = np.array([prior.keyframe_m, prior.keyframe_rad, prior.turn_rad])
     least = np.minimum(greatest, [prior.least_keyframe_m, prior.least_keyframe_rad, prior.least_turn_rad])
     solver.information = _information(greatest, count)
-    state, blocks, iterations = solver.minimise(state, max_iterations)
+    solver.observed[problem.observed_image == QUERY, 5] = IGNORED
+    state, blocks, iterations = solver.minimise(state, FIRST_ITERATIONS)
+    solver.believe_depth(state)
     solver.information = _information(_evident_sigma(solver, state, blocks, least, greatest), count)
     state, blocks, more = solver.minimise(state, max_iterations)
     covariance = _covariance(solver, blocks, state.poses[QUERY])

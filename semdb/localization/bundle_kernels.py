@@ -2,7 +2,8 @@
 
 Layouts: an image has nine unknowns: translation, rotation (both a left perturbation of ``camera_from_world``) and its
 rotation while it was read out. An observation is (x, y) normalised, its sigma, a depth in metres (NaN where there is
-none) and the row it was seen in, -0.5 at the top of the image to 0.5 at the bottom. Observations are sorted by point.
+none), the row it was seen in, -0.5 at the top of the image to 0.5 at the bottom, and what the noise of the depth is
+multiplied by. Observations are sorted by point.
 """
 
 from __future__ import annotations
@@ -26,7 +27,16 @@ def depth_sigma(depth: float) -> float:
 
 @kernel
 def _observe(
-    x: float, y: float, z: float, u: float, v: float, sigma: float, depth: float, cauchy: float, out: FloatArray
+    x: float,
+    y: float,
+    z: float,
+    u: float,
+    v: float,
+    sigma: float,
+    depth: float,
+    looser: float,
+    cauchy: float,
+    out: FloatArray,
 ) -> float:
     """Weighted residuals (out[0, :]) and their Jacobian by the camera-frame point (out[1:4, :], one row each).
 
@@ -44,7 +54,7 @@ def _observe(
     out[4, 0] = chi2
     cost: float = cauchy * np.log1p(chi2 / cauchy)
     if not np.isnan(depth):
-        spread = depth_sigma(depth)
+        spread = depth_sigma(depth) * looser
         rz = (z - depth) / spread
         depth_weight = 1.0 / np.sqrt(1.0 + rz * rz / cauchy)
         out[0, 2] = rz * depth_weight
@@ -86,8 +96,8 @@ def normal_equations(
     """Fills the blocks (all after `cauchy`) and returns the robust cost.
 
     `rotation` ``[c, 3, 3]``, `translation` ``[c, 3]``: camera_from_world; `turn` ``[c, 3]`` radians per readout;
-    `observed` ``[k, 5]`` is (x, y, sigma, depth, row). Filled: ``[c, 9, 9]``, ``[c, 9]``, ``[k, 9, 3]``, ``[m, 3, 3]``,
-    ``[m, 3]``, ``[k]``.
+    `observed` ``[k, 6]`` is (x, y, sigma, depth, row, factor of the depth's noise). Filled: ``[c, 9, 9]``, ``[c, 9]``,
+    ``[k, 9, 3]``, ``[m, 3, 3]``, ``[m, 3]``, ``[k]``.
     """
     image_blocks[:] = 0.0
     image_gradients[:] = 0.0
@@ -106,7 +116,7 @@ def normal_equations(
         x, y, z = local[0, 0], local[0, 1], local[0, 2]
         cost += _observe(
             local[1, 0], local[1, 1], local[1, 2],
-            observed[k, 0], observed[k, 1], observed[k, 2], observed[k, 3], cauchy, out,
+            observed[k, 0], observed[k, 1], observed[k, 2], observed[k, 3], observed[k, 5], cauchy, out,
         )  # fmt: skip
         chi2[k] = out[4, 0]
         for r in range(3):

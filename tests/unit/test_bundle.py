@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -139,6 +141,20 @@ def test_a_keyframe_whose_pose_is_off_is_moved_to_the_others() -> None:
         errors.append(error_of(problem, truth)[0])
         still.append(error_of(problem, truth, STILL)[0])
     assert np.mean(errors) < 0.95 * np.mean(still)
+
+
+def test_depth_that_disagrees_is_believed_less() -> None:
+    """Depth of the query 2 cm too great everywhere, ten times the sensor's noise: it may not move the pose by that."""
+    errors, without = [], []
+    for seed in range(6):
+        problem, truth = problem_of(seed, pixel_noise=0.5)
+        query = problem.observed_image == 0
+        local = transform_points(truth, problem.points)[:, 2]
+        depth = np.where(query, local[problem.observed_point] + 0.02, problem.depth)
+        errors.append(error_of(dataclasses.replace(problem, depth=depth), truth)[0])
+        without.append(error_of(problem, truth)[0])
+    assert np.median(without) < 0.002
+    assert np.median(errors) < 0.008
 
 
 def test_what_is_reported() -> None:
