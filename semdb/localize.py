@@ -73,7 +73,11 @@ def make_localizer(
     """
     check_coarse(coarse)
     source = SqlSource(store, info.id) if coarse == "sql" else IndexSource(open_index(store, info.id, settings, say))
-    return Localizer(info.name, store.map_models(info.id), source, KeyframeCache(store, info.id), options)
+    confusions: dict[str, dict[str, int]] = {}
+    for found in store.class_confusions(info.id):
+        confusions.setdefault(found.category, {})[found.other] = found.weight
+    cache = KeyframeCache(store, info.id)
+    return Localizer(info.name, store.map_models(info.id), source, cache, options, confusions)
 
 
 def open_index(

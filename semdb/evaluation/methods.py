@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 from semdb.errors import UsageError
-from semdb.localization.coarse import CoarseOptions
+from semdb.localization.coarse import CoarseOptions, Scoring
 from semdb.localization.localizer import LocalizerOptions
 from semdb.localization.matching import Evidence, MatchingOptions
 from semdb.localization.pose import PoseOptions
@@ -43,8 +43,12 @@ class Method:
     query_depth: bool = False
 
 
-# The whole budget of the default cascade, 10 keyframes, spent on the filtered set.
-_HARD = CoarseOptions(cascade=False, filtered_batches=(1, 2, 3, 4))
+# The filter as the paper has it: keyframes that share half of the query's objects, by counts, and no others.
+_PAPER_FILTER = CoarseOptions(
+    scoring=Scoring.COUNTS, minimum_share=0.5, filtered_share=1.0, cascade=False, filtered_batches=(1,)
+)
+# The same with the whole budget of the default cascade, 10 keyframes, spent on what passes.
+_HARD = replace(_PAPER_FILTER, filtered_batches=(1, 2, 3, 4))
 _ON_OBJECTS = PoseOptions(matching=MatchingOptions(evidence=Evidence.OBJECTS), guided=False)
 
 METHODS = {
@@ -60,7 +64,7 @@ METHODS = {
             "paper",
             "the paper as written: hard filter, best cosine, keypoints on objects of the same class only",
             LocalizerOptions(
-                coarse=CoarseOptions(cascade=False, filtered_batches=(1,)),
+                coarse=_PAPER_FILTER,
                 pose=_ON_OBJECTS,
                 verdict=_COUNT_ONLY,
                 neighbours=0,

@@ -1,18 +1,21 @@
 """The coarse step: which keyframes are worth matching, and in which order.
 
-A cascade. First the keyframes that share enough of the query's objects (the class-attribute filter), ranked by
-the cosine of the CNN vectors; where verification does not convince, all keyframes by cosine plus a term for the
-shared objects; then all by cosine alone. Most queries are answered by the first stage, and a missed detection
-costs time instead of the answer.
+A cascade. First the keyframes that show most of what the query shows (the class-attribute filter: the best so many by
+class score), ranked by the cosine of the CNN vectors; where verification does not convince, all keyframes by cosine
+plus a term for the class score; then all by cosine alone. Most queries are answered by the first stage, and a missed
+detection costs time instead of the answer.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from typing import Protocol
 
-from semdb.class_score import ClassQuery, class_query
+from semdb.class_score import ClassQuery, class_query, strength_query
+from semdb.localization.confusion import expand
 from semdb.localization.ranking import best_first
 from semdb.types import Float32Array, FloatArray, Int64Array
 
@@ -28,18 +31,51 @@ class Stage:
     GIVEN = "given"  # keyframes named by the caller
 
 
+class Scoring(StrEnum):
+    """Which class score: see `semdb.class_score`."""
+
+    STRENGTHS = "strengths"  # what was seen, weakly too, by half of the image
+    COUNTS = "counts"  # objects, as the paper has it
+
+
 @dataclass(frozen=True, slots=True)
 class CoarseOptions:
-    """`*_batches` are numbers of keyframes to match before asking again whether the answer convinces."""
+    """`*_batches` are numbers of keyframes to match before asking again whether the answer convinces.
+
+    The filter passes `filtered_share` of the map's keyframes, but at least `filtered_at_least` and at most
+    `filtered_at_most`: those with the best class score.
+    """
 
     use_classes: bool = True
-    minimum_share: float = 0.5  # of the query's idf-weighted objects that a keyframe must share to pass
-    filtered_at_most: int = 1000  # of the keyframes that pass, those with the best class score are ranked
-    class_weight: float = 0.15  # of the class score beside the cosine in the soft stage
+    scoring: Scoring = Scoring.STRENGTHS
+    minimum_share: float = 0.0  # class score below which a keyframe does not pass in any case
+    filtered_share: float = 0.15
+    filtered_at_least: int = 4
+    filtered_at_most: int = 1000
+    class_weight: float = 0.1  # of the class score beside the cosine in the soft stage
     filtered_batches: tuple[int, ...] = (1, 2)
     soft_batches: tuple[int, ...] = (3,)
     all_batches: tuple[int, ...] = (4,)
     cascade: bool = True  # False: the filtered set alone, as the paper has it
+    confusion: float = 0.5  # how far a class stands for those it is taken for (`semdb refine`); 0: not at all
+
+    def passing(self, keyframes: int) -> int:
+        """How many of so many keyframes pass the filter."""
+        share = math.ceil(self.filtered_share * keyframes)
+        return min(self.filtered_at_most, max(self.filtered_at_least, share))
+
+
+@dataclass(frozen=True, slots=True)
+class QueryClasses:
+    """What a query shows: objects per class, and strengths per class (`semdb.class_score.strengths`)."""
+
+    counts: Mapping[str, float]
+    strengths: Mapping[str, tuple[int, int]]
+    stands_for: Mapping[str, tuple[int, int]] = field(default_factory=dict)  # strengths of what classes are taken for
+
+    def shown(self, scoring: Scoring) -> list[str]:
+        """The classes that count."""
+        return sorted(self.counts) if scoring is Scoring.COUNTS else sorted({*self.strengths, *self.stands_for})
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,16 +161,31 @@ class CoarseSource(Protocol):
         """
 
 
+def query_classes(
+    counts: Mapping[str, float],
+    strengths: Mapping[str, tuple[int, int]],
+    confusions: Mapping[str, Mapping[str, int]],
+    options: CoarseOptions,
+) -> QueryClasses:
+    """What a query shows, and what its classes stand for by `confusions` (millionths, as `semdb refine` finds them)."""
+    upper, lower = (
+        expand({name: pair[half] for name, pair in strengths.items()}, confusions, options.confusion) for half in (0, 1)
+    )
+    names = [name for name in {*upper, *lower} if (upper.get(name, 0), lower.get(name, 0)) != strengths.get(name)]
+    stands_for = {name: (upper.get(name, 0), lower.get(name, 0)) for name in names} if confusions else {}
+    return QueryClasses(counts, strengths, stands_for)
+
+
 def cascade(
-    source: CoarseSource, counts: Mapping[str, float], query_vector: Float32Array, options: CoarseOptions
+    source: CoarseSource, classes: QueryClasses, query_vector: Float32Array, options: CoarseOptions
 ) -> Iterator[Batch]:
     """Batches of keyframes in the order in which they are worth matching; none comes twice.
 
-    `counts` are the objects of the query per class, `query_vector` ``[d]`` its unit CNN vector.
+    `query_vector` ``[d]`` is the query's unit CNN vector.
     """
     seen: set[int] = set()
     ranked = 0
-    query = _class_query(source, counts) if options.use_classes and counts else None
+    query = _class_query(source, classes, options.scoring) if options.use_classes else None
     if query is not None:
         passed = _rank_filtered(source, query, query_vector, options)
         ranked = len(passed)
@@ -150,14 +201,36 @@ def cascade(
         yield from _batches(stage, everything, seen, batches, ranked)
 
 
-def _class_query(source: CoarseSource, counts: Mapping[str, float]) -> ClassQuery:
-    return class_query(counts, source.keyframe_count(), source.document_frequencies(counts))
+def retrieve(
+    source: CoarseSource, classes: QueryClasses, query_vector: Float32Array, count: int, options: CoarseOptions
+) -> list[Proposal]:
+    """The first `count` keyframes of the coarse step alone, in its order, as if no answer ever convinced."""
+    ranking = replace(options, filtered_batches=(count,), soft_batches=(count,), all_batches=(count,))
+    found: list[Proposal] = []
+    for batch in cascade(source, classes, query_vector, ranking):
+        found += batch.proposals
+        if len(found) >= count:
+            break
+    return found[:count]
+
+
+def _class_query(source: CoarseSource, classes: QueryClasses, scoring: Scoring) -> ClassQuery | None:
+    """The query by classes; None where nothing is seen."""
+    shown = classes.shown(scoring)
+    if not shown:
+        return None
+    keyframes, frequencies = source.keyframe_count(), source.document_frequencies(shown)
+    if scoring is Scoring.COUNTS:
+        query = class_query(classes.counts, keyframes, frequencies)
+    else:
+        query = strength_query(classes.strengths, keyframes, frequencies, classes.stands_for)
+    return query if query.terms else None
 
 
 def _rank_filtered(
     source: CoarseSource, query: ClassQuery, query_vector: Float32Array, options: CoarseOptions
 ) -> Ranked:
-    passed = source.filtered(query, options.minimum_share, options.filtered_at_most)
+    passed = source.filtered(query, options.minimum_share, options.passing(source.keyframe_count()))
     cosines = source.cosines(query_vector, passed.keyframe_ids)
     order = best_first(passed.keyframe_ids, cosines)
     return Ranked(passed.keyframe_ids[order], passed.class_scores[order], cosines[order])

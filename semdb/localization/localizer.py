@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from semdb.class_score import ClassQuery
+from semdb.class_score import ClassQuery, strengths
 from semdb.database.planning import check_models
 from semdb.errors import NotFoundError
 from semdb.geometry import pose_distances
-from semdb.localization.coarse import Batch, CoarseOptions, CoarseSource, Proposal, Scored, Stage, cascade
+from semdb.localization.coarse import (
+    Batch,
+    CoarseOptions,
+    CoarseSource,
+    Proposal,
+    QueryClasses,
+    Scored,
+    Stage,
+    cascade,
+    query_classes,
+    retrieve,
+)
 from semdb.localization.confidence import Evidence, gather_evidence
 from semdb.localization.keyframe_cache import KeyframeCache
 from semdb.localization.matching import Matches
@@ -65,12 +76,14 @@ class Localizer:
         source: CoarseSource,
         cache: KeyframeCache,
         options: LocalizerOptions | None = None,
+        confusions: Mapping[str, Mapping[str, int]] | None = None,
     ) -> None:
         self.map_name = map_name
         self.models = tuple(models)
         self.source = source
         self.cache = cache
         self.options = options or LocalizerOptions()
+        self.confusions = confusions or {}  # class -> classes it is taken for -> weight in millionths
 
     def localize(self, description: Description) -> Localization:
         """The pose of `description` in the map.
@@ -80,7 +93,7 @@ class Localizer:
         search = _Search(self._view_of(description), self._check(description))
         source = _TimedSource(self.source)
         started = time.perf_counter()
-        for batch in cascade(source, _class_counts(description), description.cnn_vector, self.options.coarse):
+        for batch in cascade(source, self._classes(description), description.cnn_vector, self.options.coarse):
             search.timing_ms["rank"] += _ms_since(started)
             self._try(search, batch)
             if convinces(search.estimate, self.options.verdict):
@@ -89,6 +102,18 @@ class Localizer:
         search.timing_ms["filter"] = source.filter_ms
         search.timing_ms["rank"] -= source.filter_ms
         return self._conclude(search)
+
+    def retrieve(self, description: Description, count: int) -> list[Proposal]:
+        """The first `count` keyframes of the coarse step alone, in the order in which it would have them matched.
+
+        Raises what `localize` raises.
+        """
+        self._check(description)
+        return retrieve(self.source, self._classes(description), description.cnn_vector, count, self.options.coarse)
+
+    def _classes(self, description: Description) -> QueryClasses:
+        counts = {name: float(count) for name, count in description.category_counts.items()}
+        return query_classes(counts, strengths(description.evidence), self.confusions, self.options.coarse)
 
     def localize_among(self, description: Description, keyframe_ids: Sequence[int]) -> Localization:
         """The fine step alone, on keyframes that the caller names (the `oracle` of evaluations)."""
@@ -256,10 +281,6 @@ def _evidence(search: _Search, estimate: PoseEstimate, rival: int) -> Evidence:
     cosines = {proposal.keyframe_id: proposal.cosine for proposal in search.proposals}
     known = [cosines[keyframe.keyframe_id] for keyframe in search.keyframes]
     return gather_evidence(search.query, search.keyframes, estimate, rival, known)
-
-
-def _class_counts(description: Description) -> dict[str, float]:
-    return {name: float(count) for name, count in description.category_counts.items()}
 
 
 def _best_pairs(

@@ -3,13 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from semdb.class_score import ClassQuery
-from semdb.localization.coarse import Batch, CoarseOptions, MapChange, Ranked, Scored, Stage, cascade
+from semdb.localization.coarse import (
+    Batch,
+    CoarseOptions,
+    MapChange,
+    QueryClasses,
+    Ranked,
+    Scored,
+    Scoring,
+    Stage,
+    cascade,
+    query_classes,
+    retrieve,
+)
 from semdb.localization.ranking import best_first, exact_cosines
 from semdb.types import Float32Array, FloatArray, Int64Array
 
@@ -60,9 +73,14 @@ SOURCE_SCORES = {2: 0.9, 3: 0.6, 4: 0.3}
 SOURCE_VECTORS = {1: unit(1), 2: unit(40), 3: unit(20), 4: unit(10), 5: unit(80)}
 
 
-def run(options: CoarseOptions, counts: Mapping[str, float] | None = None) -> tuple[list[Batch], FakeSource]:
+HALF = CoarseOptions(minimum_share=0.5, filtered_share=1.0, class_weight=0.15)
+CUP = QueryClasses({"cup": 1.0}, {"cup": (10, 6)})
+NOTHING = QueryClasses({}, {})
+
+
+def run(options: CoarseOptions, classes: QueryClasses = CUP) -> tuple[list[Batch], FakeSource]:
     source = FakeSource(SOURCE_SCORES, SOURCE_VECTORS)
-    return list(cascade(source, {"cup": 1.0} if counts is None else counts, QUERY, options)), source
+    return list(cascade(source, classes, QUERY, options)), source
 
 
 def order(batches: Sequence[Batch]) -> list[tuple[str, list[int]]]:
@@ -70,7 +88,7 @@ def order(batches: Sequence[Batch]) -> list[tuple[str, list[int]]]:
 
 
 def test_filtered_keyframes_first_then_soft_then_all() -> None:
-    batches, _ = run(CoarseOptions(class_weight=0.15, filtered_batches=(1, 2), soft_batches=(1,), all_batches=(9,)))
+    batches, _ = run(replace(HALF, filtered_batches=(1, 2), soft_batches=(1,), all_batches=(9,)))
     assert order(batches) == [
         (Stage.FILTERED, [3]),  # of those that share half, the better cosine
         (Stage.FILTERED, [2]),
@@ -82,7 +100,7 @@ def test_filtered_keyframes_first_then_soft_then_all() -> None:
 
 def test_the_filtered_stage_ranks_only_what_passed() -> None:
     source = FakeSource(SOURCE_SCORES, SOURCE_VECTORS)
-    first = next(iter(cascade(source, {"cup": 1.0}, QUERY, CoarseOptions())))
+    first = next(iter(cascade(source, CUP, QUERY, HALF)))
     assert sorted(source.asked) == [2, 3]
     assert first.proposals[0].class_score == 0.6
     assert abs(first.proposals[0].cosine - np.cos(np.radians(20))) < 1e-6
@@ -94,35 +112,65 @@ def test_without_classes_all_by_cosine_with_the_same_budget() -> None:
 
 
 def test_a_query_without_objects_is_not_lost() -> None:
-    batches, _ = run(CoarseOptions(), counts={})
+    batches, _ = run(HALF, NOTHING)
     assert batches[0].stage == Stage.ALL
     assert batches[0].proposals[0].keyframe_id == 1
 
 
 def test_the_paper_stops_after_the_filter() -> None:
-    batches, source = run(CoarseOptions(cascade=False, filtered_batches=(1,)))
+    batches, source = run(replace(HALF, cascade=False, filtered_batches=(1,)))
     assert order(batches) == [(Stage.FILTERED, [3])]
     assert set(source.asked) == {2, 3}
 
 
 def test_the_paper_looks_at_nothing_without_objects() -> None:
-    assert run(CoarseOptions(cascade=False, filtered_batches=(1,)), counts={})[0] == []
+    assert run(replace(HALF, cascade=False, filtered_batches=(1,)), NOTHING)[0] == []
 
 
 def test_nothing_passes_the_filter() -> None:
     source = FakeSource({}, SOURCE_VECTORS)
-    batches = list(cascade(source, {"zebra": 1.0}, QUERY, CoarseOptions()))
+    batches = list(cascade(source, QueryClasses({}, {"zebra": (1, 0)}), QUERY, HALF))
     assert batches[0].stage == Stage.SOFT
     assert batches[0].proposals[0].keyframe_id == 1
 
 
 def test_the_filter_gives_the_best_by_class_score_and_they_are_ranked_by_cosine() -> None:
     source = FakeSource(SOURCE_SCORES, SOURCE_VECTORS)
-    options = CoarseOptions(minimum_share=0.1, filtered_at_most=2, filtered_batches=(9,))
-    first = next(iter(cascade(source, {"cup": 1.0}, QUERY, options)))
+    options = CoarseOptions(minimum_share=0.1, filtered_share=1.0, filtered_at_most=2, filtered_batches=(9,))
+    first = next(iter(cascade(source, CUP, QUERY, options)))
     assert source.at_most == [2]
     assert [proposal.keyframe_id for proposal in first.proposals] == [3, 2]
     assert first.ranked == 2
+
+
+def test_a_share_of_the_map_passes_the_filter() -> None:
+    options = CoarseOptions(filtered_share=0.15, filtered_at_least=4, filtered_at_most=1000)
+    assert [options.passing(n) for n in (1, 12, 26, 27, 40, 1000, 10**6)] == [4, 4, 4, 5, 6, 150, 1000]
+    _, source = run(replace(options, filtered_at_least=1))
+    assert source.at_most == [1]
+
+
+def test_by_counts_what_is_seen_weakly_is_not_asked_for() -> None:
+    weak = QueryClasses({}, {"cup": (0, 2)})
+    assert run(HALF, weak)[0][0].stage == Stage.FILTERED
+    assert run(replace(HALF, scoring=Scoring.COUNTS), weak)[0][0].stage == Stage.ALL
+
+
+def test_the_ranking_alone_goes_through_the_stages() -> None:
+    source = FakeSource(SOURCE_SCORES, SOURCE_VECTORS)
+    first = [retrieve(source, CUP, QUERY, count, HALF) for count in (0, 1, 3, 9)]
+    assert [[p.keyframe_id for p in found] for found in first] == [[], [3], [3, 2, 4], [3, 2, 4, 1, 5]]
+    hard = retrieve(source, CUP, QUERY, 9, replace(HALF, cascade=False))
+    assert [p.keyframe_id for p in hard] == [3, 2]
+
+
+def test_classes_stand_for_those_they_are_taken_for() -> None:
+    confusions = {"couch": {"bed": 500_000, "bench": 1}}
+    made = query_classes({"couch": 1.0}, {"couch": (4, 12), "bed": (0, 5)}, confusions, CoarseOptions(confusion=1.0))
+    assert made.stands_for == {"bed": (2, 6)}
+    assert made.shown(Scoring.STRENGTHS) == ["bed", "couch"]
+    assert made.shown(Scoring.COUNTS) == ["couch"]
+    assert query_classes({}, {"couch": (4, 12)}, confusions, CoarseOptions(confusion=0.0)).stands_for == {}
 
 
 def test_a_keyframe_that_was_deleted_meanwhile_is_left_out() -> None:
@@ -131,7 +179,7 @@ def test_a_keyframe_that_was_deleted_meanwhile_is_left_out() -> None:
             cosines = super().cosines(vector, keyframe_ids)
             return np.where(keyframe_ids == 3, np.nan, cosines)
 
-    first = next(iter(cascade(Late(SOURCE_SCORES, SOURCE_VECTORS), {"cup": 1.0}, QUERY, CoarseOptions())))
+    first = next(iter(cascade(Late(SOURCE_SCORES, SOURCE_VECTORS), CUP, QUERY, HALF)))
     assert [proposal.keyframe_id for proposal in first.proposals] == [2]
 
 
@@ -168,6 +216,6 @@ def test_a_cosine_does_not_depend_on_what_else_is_asked(size: int, rows: list[in
 def test_every_keyframe_comes_at_most_once(scores: dict[int, float], angles: list[float]) -> None:
     source = FakeSource(scores, {i: unit(angle) for i, angle in enumerate(angles)})
     options = CoarseOptions(filtered_batches=(2, 3), soft_batches=(4,), all_batches=(50,))
-    proposed = [p.keyframe_id for batch in cascade(source, {"cup": 1.0}, QUERY, options) for p in batch.proposals]
+    proposed = [p.keyframe_id for batch in cascade(source, CUP, QUERY, options) for p in batch.proposals]
     assert sorted(proposed) == list(range(21))
     assert len(source.asked) == len(set(source.asked))
