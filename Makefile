@@ -61,7 +61,7 @@ bench-output/room: | $(VENV)/.stamp-dev
 	$(BIN)/semdb synth $@
 
 bench: $(VENV)/.stamp-dev $(RECORDINGS)
-	@for file in bench/[a-z]*.py; do \
+	@for file in $$(grep -l '^if __name__' bench/[a-z]*.py); do \
 	  name=$$(basename "$$file" .py); mkdir -p bench-output; \
 	  echo "== bench.$$name"; $(BIN)/python -m "bench.$$name" $(RECORDINGS) --json "bench-output/$$name.json"; \
 	done

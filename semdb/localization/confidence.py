@@ -20,6 +20,11 @@ NEAR_PX = 12.0  # a projected point and a keypoint this near are on the same thi
 LEAST_OBJECT_POINTS = 12  # fewer points on objects say nothing about classes
 NEUTRAL_CLASSES = 0.5  # agreement of classes where there is nothing to compare
 
+FEATURES = ("first inliers", "inliers", "agreement", "spread", "explained", "coverage", "classes", "rival", "sigma")
+# Of the logistic model; fitted by ``python -m bench.trust --fit fit``. None is negative.
+WEIGHTS = (1.5, 1.5, 2.0, 2.0, 0.5, 2.0, 1.0, 2.0, 0.0)
+INTERCEPT = -12.0
+
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
@@ -150,8 +155,25 @@ def _classes_agree(query: View, tree: cKDTree, pixels: FloatArray, classes: IntA
     return int(counts.sum()), int((counts & (theirs == ours)).sum())
 
 
+def confidence_features(evidence: Evidence) -> FloatArray:
+    """What the confidence is made of ``[9]``, in the order of `FEATURES`; each grows with what speaks for the pose."""
+    rival = evidence.rival / max(evidence.first_of_best, 1)
+    return np.array(
+        [
+            np.log(max(evidence.first_inliers, 1)),
+            np.log(max(evidence.inliers, 1)),
+            evidence.agreement,
+            evidence.spread,
+            np.log(max(evidence.explained, 0.003)),
+            evidence.coverage,
+            evidence.classes,
+            -min(rival, 1.5),
+            -np.log(np.clip(evidence.sigma_m, 0.0005, 0.5)),
+        ]
+    )
+
+
 def confidence_of(evidence: Evidence) -> float:
-    """Confidence 0..1: a logistic function of inliers, their spread and the best rival's inliers."""
-    support = np.log(max(evidence.inliers, 1)) - np.log(max(evidence.rival, 6)) / 3
-    score = 3.0 * (support - 2.1) + 4.0 * (evidence.spread - 0.25)
-    return float(1 / (1 + np.exp(-score)))
+    """Probability 0..1 that the pose is within 0.25 m and 5 degrees of the truth: a logistic function."""
+    score = INTERCEPT + float(np.dot(WEIGHTS, confidence_features(evidence)))
+    return float(1 / (1 + np.exp(-np.clip(score, -30.0, 30.0))))
