@@ -1,8 +1,8 @@
 """What the reduced scan of the index loses on vectors of real images, by components and by depth of the exact ranking.
 
 ``python -m bench.reduction RECORDING... [--vectors N] [--queries N] [--keep FILE] [--json FILE]``, with SEMDB_ENCODER
-as for `semdb ingest`. Every frame is encoded many times, each time cropped, turned, mirrored, blurred, brightened or
-noisy in another way, until there are N vectors; some of them, drawn at random, are the queries. Recall@10 is the share
+as for `semdb ingest`. Every frame is encoded many times, each time cropped, turned, mirrored, blurred or lit in
+another way, until there are N vectors; some of them, drawn at random, are the queries. Recall@10 is the share
 of the exact ten nearest that the reduced scan with exact ranking of the best gives too. ``--keep`` keeps the vectors.
 """
 
@@ -28,7 +28,7 @@ from semdb.types import Float32Array, ImageArray, Int64Array
 COMPONENTS = (32, 64, 96, 128, 192, 256)
 DEPTHS = (10, 32, 64, 128, 256, 512)
 NEAREST = 10
-SHORT_SIDE = 320  # pixels to which frames are made small before they are changed
+SHORT_SIDE = 256  # pixels to which frames are made small before they are changed
 
 
 def main() -> None:
@@ -84,10 +84,10 @@ def change(image: ImageArray, random: np.random.Generator) -> ImageArray:
         image = np.ascontiguousarray(image[:, ::-1])
     if random.random() < 0.3:
         image = cv2.GaussianBlur(image, (0, 0), random.uniform(0.5, 2.5))
-    light = random.uniform(0.6, 1.4) * random.uniform(0.9, 1.1, 3)
-    changed = 255 * (image / 255.0) ** random.uniform(0.7, 1.4) * light + random.uniform(-15, 15)
-    changed += random.normal(0, random.uniform(0, 6), image.shape)
-    return np.clip(np.rint(changed), 0, 255).astype(np.uint8)
+    light = random.uniform(0.6, 1.4) * random.uniform(0.9, 1.1, (3, 1))
+    tones = 255 * (np.arange(256) / 255.0) ** random.uniform(0.7, 1.4) * light + random.uniform(-15, 15)
+    table = np.clip(np.rint(tones), 0, 255).astype(np.uint8).T.reshape(1, 256, 3)
+    return np.ascontiguousarray(cv2.LUT(image, table), np.uint8)
 
 
 def measure(vectors: Float32Array, queries: int) -> dict[str, Any]:

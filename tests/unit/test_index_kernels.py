@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from semdb.localization.index.cache_folder import first_to_merge
 from semdb.localization.index.kernels import best_rows, class_sums, scan_codes
 from semdb.localization.index.reduction import fit_reduction, sample_rows
+from semdb.types import Float32Array
 
 
 @settings(deadline=None)  # kernels are compiled at the first call
@@ -77,11 +78,12 @@ def test_the_scan_is_an_inner_product(count: int, size: int, seed: int) -> None:
     np.testing.assert_allclose(out, expected, rtol=1e-4, atol=1e-3 * size)
 
 
-def vectors_on_a_plane(count: int, size: int, rank: int, seed: int) -> np.ndarray:
+def vectors_on_a_plane(count: int, size: int, rank: int, seed: int) -> Float32Array:
     random = np.random.default_rng(seed)
     latent = random.normal(size=(count, rank)) * np.linspace(3, 1, rank)
     vectors = latent @ random.normal(size=(rank, size)) + random.normal(size=size)
-    return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.asarray(vectors, np.float32)
 
 
 def test_as_many_components_as_there_are_lose_only_the_rounding() -> None:

@@ -130,7 +130,8 @@ def write_vectors(folder: Path, pieces: Iterable[Float32Array], size: int) -> Ve
 
 def open_vectors(folder: Path, file: VectorFile, size: int, *, check: bool = True) -> Part:
     """The rows of a file, mapped into memory. Raises CacheError, FileNotFoundError."""
-    with (folder / file.name).open("rb") as opened:
+    opened = (folder / file.name).open("rb")
+    try:
         expected = _VECTORS.pack(VECTORS_MAGIC, bytes.fromhex(file.name[8:40]), file.rows, size)
         if opened.read(_VECTORS.size) != expected:
             raise CacheError(f"{file.name} is not what the index names")
@@ -138,10 +139,13 @@ def open_vectors(folder: Path, file: VectorFile, size: int, *, check: bool = Tru
             raise CacheError(f"{file.name} is truncated")
         # a private mapping may be written, so that kernels see one kind of array; nobody writes
         mapping = mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_COPY)
-    array = np.frombuffer(mapping, np.dtype("<f4"), file.rows * size, _VECTORS.size).reshape(file.rows, size)
-    part = Part(array, file.name, mapping)
-    if check:
-        _check_vectors(part, file, size)
+        array = np.frombuffer(mapping, np.dtype("<f4"), file.rows * size, _VECTORS.size).reshape(file.rows, size)
+        part = Part(array, file.name, mapping, opened, _VECTORS.size)
+        if check:
+            _check_vectors(part, file, size)
+    except BaseException:
+        opened.close()
+        raise
     return part
 
 
@@ -149,12 +153,14 @@ def _check_vectors(part: Part, file: VectorFile, size: int) -> None:
     blocks = len(file.checksums)
     if blocks != -(-file.rows // CHECK_ROWS):
         raise CacheError(f"{file.name} has checksums for other rows")
+    part.bounded = True  # while it is looked through
     most = max(1, CHECKED_BYTES // (CHECK_ROWS * size * 4))
     for block in np.unique(np.linspace(0, blocks - 1, min(blocks, most)).astype(int)).tolist():
         piece = part.array[block * CHECK_ROWS : (block + 1) * CHECK_ROWS]
         if zlib.crc32(piece.data) != file.checksums[block]:
             raise CacheError(f"{file.name} is damaged near row {block * CHECK_ROWS}")
-        part.touched(len(piece))
+        part.passed(len(piece))
+    part.bounded = False
 
 
 def remove_abandoned(folder: Path, named: Iterable[str], age_s: float = ABANDONED_S) -> None:

@@ -2,38 +2,65 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import mmap
+import os
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import BinaryIO
 
 import numpy as np
 
 from semdb.localization.ranking import exact_cosines
 from semdb.types import Float32Array, FloatArray, Int64Array
 
-DROP_AFTER = 128 * 2**20  # bytes read at random after which the pages of a mapped file leave the process's memory
+DROP_AFTER = 128 * 2**20  # bytes of a mapped file after which its pages leave the memory of this process
 
 
 @dataclass(slots=True, eq=False)
 class Part:
-    """Rows ``array[:n]`` of a file (then `name` and `mapping` are set) or in memory; never changed once visible."""
+    """Rows ``array[:n]`` in memory or of a mapped file (then `name` and the rest are set); they never change."""
 
     array: Float32Array  # [n, d]
     name: str = ""
     mapping: mmap.mmap | None = None
-    bounded: bool = False  # pages of the file may leave memory
-    _read: int = 0
+    file: BinaryIO | None = None
+    offset: int = 0  # of the first row in the file
+    bounded: bool = False  # little of the file is to be in memory at a time
+    _passed: int = 0
 
     def __len__(self) -> int:
         return len(self.array)
 
-    def touched(self, rows: int) -> None:
-        """Counts what was read. Pages count as memory of this process until they are given back."""
-        self._read += rows * self.array.shape[1] * 4
-        if self.bounded and self.mapping is not None and self._read > DROP_AFTER:
-            self._read = 0
+    def take(self, rows: Int64Array) -> Float32Array:
+        """These rows ``[n, d]``, copied.
+
+        Of a file that is to take little memory they are read, not mapped: the kernel maps many pages around each one
+        that is touched, and they all count as memory of this process. Raises OSError.
+        """
+        if not self.bounded or self.file is None:
+            return self.array[rows]
+        out = np.empty((len(rows), self.array.shape[1]), np.float32)
+        size, number = out.shape[1] * 4, self.file.fileno()
+        view = out.reshape(-1).view(np.uint8).data
+        for place, row in enumerate(rows.tolist()):
+            if os.preadv(number, [view[place * size : (place + 1) * size]], self.offset + row * size) != size:
+                raise OSError(errno.EIO, f"{self.name} is shorter than it was")
+        return out
+
+    def cosines(self, rows: Int64Array, vector: Float32Array) -> FloatArray:
+        """Exact cosines float64 ``[n]`` of these rows with `vector` ``[d]``."""
+        if self.bounded and self.file is not None:
+            return exact_cosines(self.take(rows), np.arange(len(rows)), vector)
+        return exact_cosines(self.array, rows, vector)
+
+    def passed(self, rows: int) -> None:
+        """Counts what was read in order. Pages count as memory of this process until they are given back."""
+        self._passed += rows * self.array.shape[1] * 4
+        if self.bounded and self.mapping is not None and self._passed > DROP_AFTER:
+            self._passed = 0
             self.mapping.madvise(mmap.MADV_DONTNEED)
 
 
@@ -57,14 +84,12 @@ class Vectors:
     def cosines(self, rows: Int64Array, vector: Float32Array) -> FloatArray:
         """Exact cosines float64 ``[n]`` of these rows with `vector` ``[d]``."""
         if len(self.parts) == 1:
-            self.parts[0].touched(len(rows))
-            return exact_cosines(self.parts[0].array, rows, vector)
+            return self.parts[0].cosines(rows, vector)
         out = np.empty(len(rows), np.float64)
         for part, start in zip(self.parts, self.starts(), strict=False):
             inside = np.flatnonzero((rows >= start) & (rows < start + len(part)))
             if len(inside):
-                out[inside] = exact_cosines(part.array, rows[inside] - start, vector)
-                part.touched(len(inside))
+                out[inside] = part.cosines(rows[inside] - start, vector)
         return out
 
     def take(self, rows: Int64Array) -> Float32Array:
@@ -72,8 +97,7 @@ class Vectors:
         out = np.empty((len(rows), self.size), np.float32)
         for part, start in zip(self.parts, self.starts(), strict=False):
             inside = np.flatnonzero((rows >= start) & (rows < start + len(part)))
-            out[inside] = part.array[rows[inside] - start]
-            part.touched(len(inside))
+            out[inside] = part.take(rows[inside] - start)
         return out
 
     def chunks(self, first: int = 0, size: int = 4096) -> Iterator[tuple[int, Float32Array]]:
@@ -82,7 +106,7 @@ class Vectors:
             for begin in range(max(0, first - start), len(part), size):
                 piece = part.array[begin : begin + size]
                 yield start + begin, piece
-                part.touched(len(piece))
+                part.passed(len(piece))
 
 
 class Tail:
