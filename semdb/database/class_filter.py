@@ -8,9 +8,8 @@ from __future__ import annotations
 import operator
 from collections.abc import Collection, Mapping, Sequence
 from functools import reduce
-from typing import Any
 
-from sqlalchemy import BigInteger, Connection, Engine, Select, case, func, literal, select
+from sqlalchemy import BigInteger, Connection, Engine, case, func, literal, select
 from sqlalchemy.sql.elements import ColumnElement
 
 from semdb.class_score import SCALE, ClassQuery, ClassTerm, Part, class_query
@@ -74,12 +73,9 @@ def class_filter(
         known = _known(connection, query)
         if not known:
             return []
-        statement, points = _scores(map_id, query, known)
-        statement = (
-            statement.having(points >= query.least(minimum_share))
-            .order_by(points.desc(), keyframe_categories.c.keyframe_id)
-            .limit(at_most)
-        )
+        keyframe_id, points = _scores(map_id, query, known)
+        statement = select(keyframe_id, points).where(points >= query.least(minimum_share))
+        statement = statement.order_by(points.desc(), keyframe_id).limit(at_most)
         return [ScoredKeyframe(row[0], int(row[1]) / query.whole) for row in connection.execute(statement)]
 
     return retry.read(engine, work)
@@ -93,9 +89,8 @@ def class_scores(engine: Engine, map_id: int, query: ClassQuery, keyframe_ids: S
         known = _known(connection, query)
         found: dict[int, float] = {}
         for start in range(0, len(keys) if known else 0, CHUNK):
-            statement, points = _scores(map_id, query, known)
-            chunk = statement.where(keyframe_categories.c.keyframe_id.in_(keys[start : start + CHUNK]))
-            rows = connection.execute(chunk.having(points > 0))
+            keyframe_id, points = _scores(map_id, query, known, keys[start : start + CHUNK])
+            rows = connection.execute(select(keyframe_id, points).where(points > 0))
             found.update((row[0], int(row[1]) / query.whole) for row in rows)
         return found
 
@@ -115,37 +110,45 @@ def _known(connection: Connection, query: ClassQuery) -> list[tuple[int, ClassTe
 
 
 def _scores(
-    map_id: int, query: ClassQuery, known: list[tuple[int, ClassTerm]]
-) -> tuple[Select[Any], ColumnElement[int]]:
-    """Keyframe and points, grouped by keyframe; and the points for conditions on them.
+    map_id: int, query: ClassQuery, known: list[tuple[int, ClassTerm]], keyframe_ids: Sequence[int] | None = None
+) -> tuple[ColumnElement[int], ColumnElement[int]]:
+    """Keyframe and points of all keyframes of a map, or of these, that have a row of a class of the query.
 
-    A quotient is taken of what can be divided: servers round each in their own way.
+    The sums are in a subquery, so that a server adds once, however often a condition or an order names them. A
+    quotient is taken of what can be divided: servers round each in their own way.
     """
     c = keyframe_categories.c
-    points: ColumnElement[int] = func.sum(_contribution(known))
-    if query.per_held:
-        whole = literal(query.total, BigInteger) + literal(query.per_held, BigInteger) * func.max(c.keyframe_strength)
-        scaled, union = points * literal(SCALE, BigInteger), whole - points
-        points = (scaled - scaled % union) // union
     ids = sorted({category_id for category_id, _ in known})
-    statement = select(c.keyframe_id, points).where(c.map_id == map_id, c.category_id.in_(ids)).group_by(c.keyframe_id)
-    return statement, points
+    columns = [c.keyframe_id, func.sum(_contribution(known)).label("shared")]
+    if query.per_held:
+        columns.append(func.max(c.keyframe_strength).label("held"))
+    rows = select(*columns).where(c.map_id == map_id).group_by(c.keyframe_id)
+    if keyframe_ids is not None:
+        rows = rows.where(c.category_id.in_(ids), c.keyframe_id.in_(keyframe_ids))
+    else:
+        # Class by class: MariaDB otherwise prefers to read the index entries of all classes of the map.
+        rows = rows.join_from(categories, keyframe_categories, c.category_id == categories.c.id)
+        rows = rows.where(categories.c.id.in_(ids)).prefix_with("STRAIGHT_JOIN", dialect="mysql")
+    sums = rows.subquery("sums").c
+    if not query.per_held:
+        return sums.keyframe_id, sums.shared
+    whole = literal(query.total, BigInteger) + literal(query.per_held, BigInteger) * sums.held
+    scaled, union = sums.shared * literal(SCALE, BigInteger), whole - sums.shared
+    return sums.keyframe_id, (scaled - scaled % union) // union
 
 
 def _contribution(known: list[tuple[int, ClassTerm]]) -> ColumnElement[int]:
     """What one row (category, keyframe) adds: the sum of ``min(full, per_object * value)`` of its parts."""
-    parts = {part: [pair for pair in known if pair[1].part is part] for part in Part}
-    branches = [_of_part(part, terms) for part, terms in parts.items() if terms]
-    return reduce(operator.add, branches)
-
-
-def _of_part(part: Part, known: list[tuple[int, ClassTerm]]) -> ColumnElement[int]:
-    c = keyframe_categories.c
-    value = {Part.COUNT: c.count, Part.UPPER: c.upper_strength, Part.LOWER: c.lower_strength}[part]
-    branches: list[tuple[ColumnElement[bool], ColumnElement[int]]] = []
+    by_category: dict[int, list[ColumnElement[int]]] = {}
     for category_id, term in known:
-        full, per_object = literal(term.full, BigInteger), literal(term.per_object, BigInteger)
-        enough = -(-term.full // term.per_object)
-        branches.append(((c.category_id == category_id) & (value >= enough), full))
-        branches.append((c.category_id == category_id, per_object * value))
-    return case(*branches, else_=literal(0, BigInteger))
+        by_category.setdefault(category_id, []).append(_of_term(term))
+    values = {category_id: reduce(operator.add, terms) for category_id, terms in by_category.items()}
+    return case(values, value=keyframe_categories.c.category_id, else_=literal(0, BigInteger))
+
+
+def _of_term(term: ClassTerm) -> ColumnElement[int]:
+    c = keyframe_categories.c
+    value = {Part.COUNT: c.count, Part.UPPER: c.upper_strength, Part.LOWER: c.lower_strength}[term.part]
+    full, per_object = literal(term.full, BigInteger), literal(term.per_object, BigInteger)
+    enough = -(-term.full // term.per_object)
+    return case((value >= enough, full), else_=per_object * value)
