@@ -23,6 +23,8 @@ class SyntheticOptions:
     With `person` somebody walks to and fro before the camera.
     Rooms to be confused with others: `furniture_seed` puts the furniture of another seed into the room, `alike` mirrors
     every texture (same shapes, same colours, another room), `desks` furnishes it with so many equal workplaces.
+    Masks as a real detector's: of the instances of every frame a share `missed` is not there, and a share `confused`
+    goes by the name of a class that detectors take it for.
     """
 
     frames: int = 120
@@ -39,6 +41,8 @@ class SyntheticOptions:
     alike: bool = False
     desks: int = 0
     person: bool = False
+    missed: float = 0.0
+    confused: float = 0.0
 
     def __post_init__(self) -> None:
         """Raises UsageError naming the option that makes no sense."""
@@ -53,6 +57,8 @@ class SyntheticOptions:
             ("lap_frames", 8, 1_000_000),
             ("furniture_seed", 0, 2**32 - 1),
             ("desks", 0, 8),
+            ("missed", 0.0, 1.0),
+            ("confused", 0.0, 1.0),
         )
         for name, low, high in limits:
             value = getattr(self, name)

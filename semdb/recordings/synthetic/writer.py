@@ -20,6 +20,7 @@ import numpy.typing as npt
 from semdb.errors import UsageError
 from semdb.geometry import quat_wxyz_from_rotation
 from semdb.recordings.synthetic import sensor
+from semdb.recordings.synthetic.mistakes import make_mistakes, with_misnamed
 from semdb.recordings.synthetic.options import DEPTH_SCALE, FRAME_RATE_HZ, SyntheticOptions
 from semdb.recordings.synthetic.person import CATEGORY as PERSON
 from semdb.recordings.synthetic.person import walker_for
@@ -88,6 +89,10 @@ class SyntheticSequence:
     @property
     def classes(self) -> dict[int, str]:
         """COCO-style class name of each label."""
+        classes = self._true_classes()
+        return with_misnamed(classes) if self.options.confused > 0 else classes
+
+    def _true_classes(self) -> dict[int, str]:
         return self.room.classes() | ({} if self._walker is None else {self._walker.label: PERSON})
 
     def timestamp(self, index: int) -> float:
@@ -108,7 +113,10 @@ class SyntheticSequence:
         if options.noise:
             rng = np.random.default_rng([options.seed, 5, index])
             rgb, depth = sensor.noisy_image(rgb, rng), sensor.noisy_depth(depth, self.camera, rng)
-        return SyntheticFrame(rgb, depth, view.labels, pose)
+        labels = view.labels
+        if options.missed > 0 or options.confused > 0:
+            labels = make_mistakes(labels, self._true_classes(), options.missed, options.confused, options.seed, index)
+        return SyntheticFrame(rgb, depth, labels, pose)
 
 
 def write_synthetic_recording(
