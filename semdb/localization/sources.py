@@ -22,9 +22,10 @@ class SqlSource:
         self._map_id = map_id
         self._changes = ChangeReader(store, map_id)
         self._count: int | None = None
+        self._frequencies: dict[str, int] = {}
 
     def refresh(self) -> MapChange:
-        """Nothing is kept here but the number of keyframes; what others keep may be out of date."""
+        """Nothing is kept here but numbers of keyframes, of all and by class; what others keep may be out of date."""
         if self._count is None:
             self._changes.skip()
             self._count = self._store.keyframe_count(self._map_id)
@@ -32,6 +33,7 @@ class SqlSource:
         change = summary_of(self._changes.read())
         if change:
             self._count = self._store.keyframe_count(self._map_id)
+            self._frequencies = {}
         return change
 
     def keyframe_count(self) -> int:
@@ -40,7 +42,11 @@ class SqlSource:
         return self._count or 0
 
     def document_frequencies(self, categories: Collection[str]) -> dict[str, int]:
-        return self._store.document_frequencies(self._map_id, categories)
+        unknown = [name for name in categories if name not in self._frequencies]
+        if unknown:
+            found = self._store.document_frequencies(self._map_id, unknown)
+            self._frequencies.update((name, found.get(name, 0)) for name in unknown)
+        return {name: self._frequencies[name] for name in categories}
 
     def filtered(self, query: ClassQuery, minimum_share: float, at_most: int | None) -> Scored:
         found = self._store.class_filter(self._map_id, query, minimum_share, at_most)
