@@ -8,12 +8,12 @@ stricter ratio, a pair of the same class is also accepted when only its class' o
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import KDTree
 
 from semdb.types import BoolArray, Float32Array, FloatArray, IntArray
 
@@ -64,20 +64,9 @@ def squared_distances(first: npt.NDArray[np.generic], second: npt.NDArray[np.gen
         hamming: Float32Array = a.sum(1)[:, None] + b.sum(1)[None] - 2 * (a @ b.T)
         return hamming
     product = np.asarray(first, np.float32) @ np.asarray(second, np.float32).T
-    return np.asarray(np.maximum(2 - 2 * product, 0), np.float32)
-
-
-def _two_nearest(distances: Float32Array) -> tuple[IntArray, Float32Array, Float32Array]:
-    """Index of the nearest, its distance, and the second nearest distance (inf where there is none), per row."""
-    rows = np.arange(len(distances))
-    nearest = distances.argmin(axis=1).astype(np.int32)
-    best = distances[rows, nearest].copy()
-    if distances.shape[1] < 2:
-        return nearest, best, np.full(len(distances), np.inf, np.float32)
-    distances[rows, nearest] = np.inf
-    second = distances.min(axis=1)
-    distances[rows, nearest] = best
-    return nearest, best, second
+    product *= -2
+    product += 2
+    return np.asarray(np.maximum(product, 0, out=product), np.float32)
 
 
 def _ratio_power(dtype: np.dtype[np.generic]) -> int:
@@ -85,13 +74,29 @@ def _ratio_power(dtype: np.dtype[np.generic]) -> int:
     return 1 if dtype == np.uint8 else 2
 
 
-def _mutual_ratio_pairs(distances: Float32Array, ratio: float | Float32Array) -> tuple[IntArray, IntArray]:
-    """Mutual nearest neighbours whose distance is below `ratio` (to the power of the measure) of the second."""
-    nearest, best, second = _two_nearest(distances)
-    rows = np.arange(len(distances), dtype=np.int32)
-    mutual = distances.argmin(axis=0)[nearest] == rows
-    accepted = mutual & (best < ratio * second)
-    return rows[accepted], nearest[accepted]
+@dataclass(frozen=True, slots=True, eq=False)
+class _Mutual:
+    """Mutual nearest neighbours, and what the ratio test needs of them."""
+
+    rows: IntArray  # [k]
+    columns: IntArray  # [k]
+    distance: Float32Array  # [k]
+    second: Float32Array  # [k] distance of the second nearest column, inf where there is none
+
+    def passing(self, ratio: float | FloatArray) -> BoolArray:
+        return np.asarray(self.distance < ratio * self.second)
+
+
+def _mutual(distances: Float32Array, rows: IntArray, columns: IntArray) -> _Mutual:
+    """Mutual nearest neighbours between `rows` and `columns` of `distances` ``[n, m]``."""
+    from semdb.localization.matching_kernels import scan
+
+    n, m = len(rows), len(columns)
+    nearest, best, second = np.empty(n, np.int32), np.empty(n, np.float32), np.empty(n, np.float32)
+    best_back = np.empty(m, np.float32)
+    scan(distances, rows, columns, nearest, best, second, best_back)
+    keep = best <= best_back[nearest]
+    return _Mutual(rows[keep], columns[nearest[keep]], best[keep], second[keep])
 
 
 def match_keypoints(
@@ -100,71 +105,81 @@ def match_keypoints(
     query_classes: IntArray,
     keyframe_classes: IntArray,
     options: MatchingOptions | None = None,
+    *,
+    query_signs: npt.NDArray[np.int8] | None = None,
+    keyframe_signs: npt.NDArray[np.int8] | None = None,
 ) -> Matches:
     """Pairs between two sets of descriptors ``[n, d]`` and ``[m, d]`` of one kind.
 
     `query_classes` ``[n]`` and `keyframe_classes` ``[m]`` are class numbers of the object each keypoint lies on
-    (any numbering shared by both), -1 in the background.
+    (any numbering shared by both), -1 in the background. With signs of the Laplacian, ``[n]`` and ``[m]``, only
+    keypoints of equal sign are compared (bright blobs with bright ones: Bay et al., SURF, section 4.3), which is
+    also half the work.
     """
     options = options or MatchingOptions()
-    if len(query_descriptors) == 0 or len(keyframe_descriptors) == 0:
-        return _no_matches()
-    distances = squared_distances(query_descriptors, keyframe_descriptors)
-    power = _ratio_power(query_descriptors.dtype)
-    found: dict[tuple[int, int], None] = {}
-    if options.evidence is Evidence.ALL:
-        i, j = _mutual_ratio_pairs(distances, options.ratio**power)
-        keep = _not_contradicting(distances, i, j, query_classes, keyframe_classes, options, power)
-        found.update(dict.fromkeys(zip(i[keep].tolist(), j[keep].tolist(), strict=True)))
-    taken_query = {pair[0] for pair in found}
-    taken_keyframe = {pair[1] for pair in found}
-    for pair in _same_class_pairs(distances, query_classes, keyframe_classes, options.ratio**power):
-        if pair[0] not in taken_query and pair[1] not in taken_keyframe:
-            found[pair] = None
-    return _as_matches(sorted(found), distances, query_classes, keyframe_classes)
+    if query_signs is None or keyframe_signs is None:
+        query_signs, keyframe_signs = (
+            np.zeros(len(query_descriptors), np.int8),
+            np.zeros(len(keyframe_descriptors), np.int8),
+        )
+    found = []
+    for sign in np.intersect1d(query_signs, keyframe_signs):
+        rows = np.flatnonzero(query_signs == sign).astype(np.int32)
+        columns = np.flatnonzero(keyframe_signs == sign).astype(np.int32)
+        here = _match_block(
+            query_descriptors[rows],
+            keyframe_descriptors[columns],
+            query_classes[rows],
+            keyframe_classes[columns],
+            options,
+        )
+        found.append(Matches(rows[here.query], columns[here.keyframe], here.distance, here.same_class))
+    return _sorted(found)
 
 
-def _not_contradicting(
-    distances: Float32Array,
-    i: IntArray,
-    j: IntArray,
+def _match_block(
+    query_descriptors: npt.NDArray[np.generic],
+    keyframe_descriptors: npt.NDArray[np.generic],
     query_classes: IntArray,
     keyframe_classes: IntArray,
     options: MatchingOptions,
-    power: int,
-) -> BoolArray:
-    """Pairs on objects of two different classes stay only where they pass the stricter ratio."""
-    q, k = query_classes[i], keyframe_classes[j]
-    contradicts = (q != k) & (q != BACKGROUND) & (k != BACKGROUND)
-    keep: BoolArray = ~contradicts
-    if contradicts.any():
-        _, best, second = _two_nearest(distances[i[contradicts]])
-        keep[contradicts] = best < options.contradiction_ratio**power * second
-    return keep
-
-
-def _same_class_pairs(
-    distances: Float32Array, query_classes: IntArray, keyframe_classes: IntArray, ratio: float
-) -> list[tuple[int, int]]:
-    pairs: list[tuple[int, int]] = []
+) -> Matches:
+    """Pairs of descriptors that may all be compared. First the whole image, then what the classes add."""
+    distances = squared_distances(query_descriptors, keyframe_descriptors)
+    power = _ratio_power(query_descriptors.dtype)
+    taken_query, taken_keyframe = (np.zeros(size, np.bool_) for size in distances.shape)
+    found: list[tuple[IntArray, IntArray]] = []
+    if options.evidence is Evidence.ALL:
+        everything = (np.arange(size, dtype=np.int32) for size in distances.shape)
+        pairs = _mutual(distances, *everything)
+        q, k = query_classes[pairs.rows], keyframe_classes[pairs.columns]
+        contradicts = (q != k) & (q != BACKGROUND) & (k != BACKGROUND)
+        keep = pairs.passing(np.where(contradicts, options.contradiction_ratio, options.ratio) ** power)
+        found.append((pairs.rows[keep], pairs.columns[keep]))
+        taken_query[pairs.rows[keep]] = taken_keyframe[pairs.columns[keep]] = True
     for category in np.intersect1d(query_classes, keyframe_classes):
         if category == BACKGROUND:
             continue
-        rows = np.flatnonzero(query_classes == category)
-        columns = np.flatnonzero(keyframe_classes == category)
-        i, j = _mutual_ratio_pairs(distances[np.ix_(rows, columns)], ratio)
-        pairs += zip(rows[i].tolist(), columns[j].tolist(), strict=True)
-    return pairs
-
-
-def _as_matches(
-    pairs: list[tuple[int, int]], distances: Float32Array, query_classes: IntArray, keyframe_classes: IntArray
-) -> Matches:
-    if not pairs:
-        return _no_matches()
-    i, j = np.array(pairs, np.int32).T
+        rows = np.flatnonzero(query_classes == category).astype(np.int32)
+        columns = np.flatnonzero(keyframe_classes == category).astype(np.int32)
+        pairs = _mutual(distances, rows, columns)
+        keep = pairs.passing(options.ratio**power) & ~taken_query[pairs.rows] & ~taken_keyframe[pairs.columns]
+        found.append((pairs.rows[keep], pairs.columns[keep]))
+    i = np.concatenate([pair[0] for pair in found]) if found else np.zeros(0, np.int32)
+    j = np.concatenate([pair[1] for pair in found]) if found else np.zeros(0, np.int32)
     same = (query_classes[i] == keyframe_classes[j]) & (query_classes[i] != BACKGROUND)
     return Matches(i, j, distances[i, j], same)
+
+
+def _sorted(blocks: Sequence[Matches]) -> Matches:
+    """The pairs of all `blocks` by the query's index."""
+    if not blocks:
+        return _no_matches()
+    i, j = np.concatenate([b.query for b in blocks]), np.concatenate([b.keyframe for b in blocks])
+    order = np.lexsort((j, i))
+    distance = np.concatenate([b.distance for b in blocks])
+    same = np.concatenate([b.same_class for b in blocks])
+    return Matches(i[order], j[order], distance[order], same[order])
 
 
 def match_guided(
@@ -175,6 +190,9 @@ def match_guided(
     query_classes: IntArray,
     keyframe_classes: IntArray,
     options: MatchingOptions | None = None,
+    *,
+    query_signs: npt.NDArray[np.int8] | None = None,
+    keyframe_signs: npt.NDArray[np.int8] | None = None,
 ) -> Matches:
     """Second matching with a pose at hand: only keypoints near the projection of a keyframe's points compete.
 
@@ -188,6 +206,9 @@ def match_guided(
         return _no_matches()
     i, j = _pairs_within(query_xy, projected_xy[visible], options.guided_radius_px)
     j = visible[j].astype(np.int32)
+    if query_signs is not None and keyframe_signs is not None:
+        equal = query_signs[i] == keyframe_signs[j]
+        i, j = i[equal], j[equal]
     same_class = (query_classes[i] == keyframe_classes[j]) & (query_classes[i] != BACKGROUND)
     if options.evidence is Evidence.OBJECTS:
         i, j, same_class = i[same_class], j[same_class], same_class[same_class]
@@ -206,8 +227,18 @@ def match_guided(
 
 def _pairs_within(first: FloatArray, second: FloatArray, radius: float) -> tuple[IntArray, IntArray]:
     """Indexes of all pairs of points ``[n, 2]`` and ``[m, 2]`` that are at most `radius` apart."""
-    near = KDTree(first).sparse_distance_matrix(KDTree(second), radius, output_type="coo_matrix")
-    return near.row.astype(np.int32), near.col.astype(np.int32)
+    from semdb.localization.matching_kernels import count_near
+
+    x, y = np.ascontiguousarray(first[:, 0]), np.ascontiguousarray(first[:, 1])
+    to_x, to_y = np.ascontiguousarray(second[:, 0]), np.ascontiguousarray(second[:, 1])
+    order = np.argsort(x, kind="stable")
+    room = 8 * (len(first) + len(second))
+    while True:
+        i, j = np.empty(room, np.int32), np.empty(room, np.int32)
+        found = count_near(x, y, order, to_x, to_y, radius, i, j)
+        if found <= room:
+            return i[:found], j[:found]
+        room = found
 
 
 def _paired_distances(
@@ -217,22 +248,19 @@ def _paired_distances(
     if first.dtype == np.uint8:
         differing = np.bitwise_count(np.asarray(first[i], np.uint8) ^ np.asarray(second[j], np.uint8))
         return np.asarray(differing.sum(axis=1), np.float32)
-    product = np.einsum("kd,kd->k", np.asarray(first[i], np.float32), np.asarray(second[j], np.float32))
+    from semdb.localization.matching_kernels import dot_pairs
+
+    product = np.empty(len(i), np.float32)
+    dot_pairs(np.asarray(first, np.float32), np.asarray(second, np.float32), i, j, product)
     return np.asarray(np.maximum(2 - 2 * product, 0), np.float32)
 
 
 def _two_least(values: Float32Array, groups: IntArray, count: int) -> tuple[Float32Array, Float32Array]:
     """Least and second least of the `values` of each of `count` groups; inf where there is none."""
-    least = np.full(count, np.inf, np.float32)
-    second = np.full(count, np.inf, np.float32)
-    order = np.lexsort((values, groups))
-    sorted_groups = groups[order]
-    first = np.flatnonzero(np.diff(sorted_groups, prepend=-1) != 0)
-    least[sorted_groups[first]] = values[order[first]]
-    following = first + 1
-    following = following[following < len(order)]
-    following = following[sorted_groups[following] == sorted_groups[following - 1]]
-    second[sorted_groups[following]] = values[order[following]]
+    from semdb.localization.matching_kernels import two_least
+
+    least, second = np.full(count, np.inf, np.float32), np.full(count, np.inf, np.float32)
+    two_least(values, groups, least, second)
     return least, second
 
 

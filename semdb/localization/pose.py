@@ -84,7 +84,10 @@ def join_pairs(matches: Sequence[Matches]) -> Pairs:
 def match_view(query: View, keyframe: KeyframeView, options: MatchingOptions) -> Matches:
     """First matching, without a pose."""
     view = keyframe.view
-    return match_keypoints(query.descriptors, view.descriptors, query.classes, view.classes, options)
+    return match_keypoints(
+        query.descriptors, view.descriptors, query.classes, view.classes, options,
+        query_signs=query.signs, keyframe_signs=view.signs,
+    )  # fmt: skip
 
 
 def world_points_of(pairs: Pairs, keyframes: Sequence[KeyframeView]) -> FloatArray:
@@ -156,6 +159,8 @@ def guided_pairs(
                 query.classes,
                 view.classes,
                 options.matching,
+                query_signs=query.signs,
+                keyframe_signs=view.signs,
             )
         )
     return join_pairs(matches)

@@ -27,6 +27,7 @@ class View:
     size: Float32Array  # [n] pixels
     descriptors: npt.NDArray[np.generic]  # [n, d]
     classes: IntArray  # [n], -1 in the background
+    signs: npt.NDArray[np.int8]  # [n] of the Laplacian, 0 where the feature has none
     points: Float32Array  # [n, 3] camera frame, NaN where there is no depth
     source: IntArray  # [n]
 
@@ -87,6 +88,7 @@ def make_view(
         size=features.size[keep],
         descriptors=features.descriptors[keep],
         classes=table[keypoints.object_index[keep]],  # -1 takes the last entry: the background
+        signs=features.laplacian[keep],
         points=keypoints.points[keep],
         source=keep.astype(np.int32),
     )

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from semdb.localization.matching import (
     Evidence,
@@ -12,6 +14,7 @@ from semdb.localization.matching import (
     match_keypoints,
     squared_distances,
 )
+from semdb.localization.matching_kernels import count_near, scan, two_least
 
 RANDOM = np.random.default_rng(0)
 
@@ -107,3 +110,56 @@ def test_guided_matching_looks_near_the_projection_only(kind: str) -> None:
     assert len(match_guided(repeated, descriptors, twice_xy, nowhere, background(100), classes)) == 0
     away = match_guided(repeated, descriptors, twice_xy, xy + 5000, background(100), classes)
     assert len(away) == 0
+
+
+def test_only_keypoints_of_equal_sign_match() -> None:
+    query = unit_rows(80)
+    signs = np.where(np.arange(80) % 2 == 0, 1, -1).astype(np.int8)
+    everything = match_keypoints(query, query, background(80), background(80), query_signs=signs, keyframe_signs=signs)
+    np.testing.assert_array_equal(everything.query, np.arange(80))
+    np.testing.assert_array_equal(everything.keyframe, np.arange(80))
+    turned = np.where(np.arange(80) < 20, -signs, signs).astype(np.int8)
+    some = match_keypoints(query, query, background(80), background(80), query_signs=signs, keyframe_signs=turned)
+    assert (signs[some.query] == turned[some.keyframe]).all()
+    assert set(range(20, 80)) <= set(some.query.tolist())
+    xy = RANDOM.uniform(0, 600, (80, 2))
+    near = match_guided(query, query, xy, xy, background(80), background(80), query_signs=signs, keyframe_signs=turned)
+    assert (signs[near.query] == turned[near.keyframe]).all()
+    assert len(near) >= 60
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10**6), n=st.integers(1, 30), m=st.integers(1, 30))
+def test_scan_is_a_search_of_all(seed: int, n: int, m: int) -> None:
+    random = np.random.default_rng(seed)
+    distances = random.random((40, 40)).astype(np.float32)
+    rows = np.sort(random.permutation(40)[:n]).astype(np.int32)
+    columns = np.sort(random.permutation(40)[:m]).astype(np.int32)
+    nearest, best, second, back = np.empty(n, np.int32), *(np.empty(k, np.float32) for k in (n, n, m))
+    scan(distances, rows, columns, nearest, best, second, back)
+    block = distances[np.ix_(rows, columns)]
+    np.testing.assert_array_equal(nearest, block.argmin(axis=1))
+    np.testing.assert_array_equal(best, block.min(axis=1))
+    np.testing.assert_array_equal(back, block.min(axis=0))
+    expected = np.sort(block, axis=1)[:, 1] if m > 1 else np.full(n, np.inf)
+    np.testing.assert_array_equal(second, expected)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10**6), n=st.integers(1, 60), m=st.integers(1, 60), radius=st.floats(0.5, 40))
+def test_near_pairs_are_those_of_a_search_of_all(seed: int, n: int, m: int, radius: float) -> None:
+    random = np.random.default_rng(seed)
+    a, b = random.uniform(0, 100, (n, 2)), random.uniform(0, 100, (m, 2))
+    i, j = np.empty(n * m, np.int32), np.empty(n * m, np.int32)
+    found = count_near(
+        a[:, 0].copy(), a[:, 1].copy(), np.argsort(a[:, 0]), b[:, 0].copy(), b[:, 1].copy(), radius, i, j
+    )
+    near = np.argwhere(((a[:, None] - b[None]) ** 2).sum(axis=2) <= radius**2)
+    assert sorted(zip(i[:found].tolist(), j[:found].tolist(), strict=True)) == sorted(map(tuple, near.tolist()))
+    values = random.random(found).astype(np.float32)
+    least, second = np.full(n, np.inf, np.float32), np.full(n, np.inf, np.float32)
+    two_least(values, i[:found], least, second)
+    for group in range(n):
+        own = np.sort(values[i[:found] == group])
+        assert least[group] == (own[0] if len(own) else np.inf)
+        assert second[group] == (own[1] if len(own) > 1 else np.inf)
