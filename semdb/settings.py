@@ -39,7 +39,7 @@ class Settings(BaseSettings):
     threads: int = Field(2, ge=1, le=256, description="threads of one process for networks and kernels")
     cache_dir: Path = Field(Path("~/.cache/semdb"), description="model files in models/, indexes in index/")
     index_exact_up_to: int = Field(
-        100_000, ge=0, description="keyframes of a map up to which an index compares every vector exactly"
+        20_000, ge=0, description="keyframes of a map up to which an index compares every vector exactly"
     )
     broker_url: str = Field(
         "redis://localhost:6379/0", description="broker of the workers, redis://HOST:PORT/N or another of Celery's"

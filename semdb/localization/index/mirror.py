@@ -25,7 +25,7 @@ SPARE_ROWS = 1024
 class IndexOptions:
     """How an index works. `threads` are those of one query."""
 
-    exact_up_to: int = 100_000  # keyframes of a map up to which all vectors are compared exactly
+    exact_up_to: int = 20_000  # keyframes of a map up to which all vectors are compared exactly
     components: int = 128  # of a reduced vector
     rerank: int = 256  # keyframes that the reduced scan hands on to the exact ranking
     threads: int = 2
