@@ -31,6 +31,10 @@ class ModelError(SemdbError):
     """A detector, encoder or feature is missing, broken or not what it claims to be."""
 
 
+class TrainingError(SemdbError):
+    """Training data or a training run cannot be used; the message names the file and what in it is wrong."""
+
+
 class DatabaseError(SemdbError):
     """The database does not answer, or refused a statement for good."""
 

@@ -33,6 +33,8 @@ COMMANDS: dict[str, str] = {
     "sql": "semdb.cli.sql",
     "keypoints": "semdb.cli.keypoints",
     "models": "semdb.cli.models",
+    "train": "semdb.cli.train",
+    "evaluate-detector": "semdb.cli.evaluate_detector",
     "synth": "semdb.cli.synth",
     "doctor": "semdb.cli.doctor",
 }

@@ -24,6 +24,11 @@ def command(
         bool, typer.Option("--second-visit", help="Another walk through the same room, some objects moved.")
     ] = False,
     lap_frames: Annotated[int, typer.Option(help="Frames in which the camera turns once around.")] = 120,
+    coco: Annotated[
+        bool, typer.Option("--coco", help="Instance segmentation data in COCO's format instead of a recording.")
+    ] = False,
+    rooms: Annotated[int, typer.Option(help="With --coco: rooms, from --room-seed on, each with --frames images.")] = 1,
+    split: Annotated[str, typer.Option(help="With --coco: name of the split.")] = "train",
     person: Annotated[bool, typer.Option("--person", help="Somebody walks to and fro before the camera.")] = False,
 ) -> None:
     """Render a furnished room as a recording.
@@ -32,6 +37,7 @@ def command(
     """
     from semdb.cli.progress import Progress
     from semdb.recordings.synthetic import SyntheticOptions, write_synthetic_recording
+    from semdb.recordings.synthetic.coco import write_synthetic_coco
 
     options = SyntheticOptions(
         frames=frames,
@@ -46,6 +52,11 @@ def command(
         lap_frames=lap_frames,
         person=person,
     )
+    if coco:
+        with Progress("rendering", unit="images") as progress:
+            write_synthetic_coco(directory, options, rooms, split, progress.update)
+        print(f"wrote {rooms * frames} images of {rooms} rooms to {directory / split}")
+        return
     with Progress("rendering") as progress:
         write_synthetic_recording(directory, options, progress.update)
     print(f"wrote {frames} frames of {width}x{height} to {directory}")

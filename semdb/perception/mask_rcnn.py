@@ -26,7 +26,9 @@ class Architecture:
     """`backbone` is one of `BACKBONES`, `version` 1 (frozen statistics, torchvision's first) or 2 (v2's heads).
 
     `epsilon` is that of frozen batch normalisation. `min_size`, `max_size`: the image is resized inside so that its
-    shorter side has `min_size` pixels, the longer one at most `max_size`.
+    shorter side has `min_size` pixels, the longer one at most `max_size`. `anchor`: side of the smallest anchor boxes
+    in pixels of the resized image; each of the five levels doubles it. `channels` are those of FPN and heads: 256 in
+    the paper; 64 cost a tenth, for small data and CPUs.
     """
 
     backbone: str = "resnet50"
@@ -34,6 +36,8 @@ class Architecture:
     epsilon: float = 1e-5
     min_size: int = 800
     max_size: int = 1333
+    anchor: int = 32
+    channels: int = 256
 
     @property
     def name(self) -> str:
@@ -47,10 +51,15 @@ def build(architecture: Architecture, classes: int, *, frozen: bool = True) -> A
     have the same weights and, in inference, the same results. Raises ModelError.
     """
     import_torch()
+    import torchvision
     from torch.nn import BatchNorm2d
     from torchvision.models.detection import MaskRCNN, maskrcnn_resnet50_fpn_v2
-    from torchvision.models.detection.backbone_utils import resnet_fpn_backbone
+    from torchvision.models.detection.anchor_utils import AnchorGenerator
+    from torchvision.models.detection.backbone_utils import BackboneWithFPN
+    from torchvision.models.detection.faster_rcnn import FastRCNNPredictor, TwoMLPHead
+    from torchvision.models.detection.mask_rcnn import MaskRCNNHeads, MaskRCNNPredictor
     from torchvision.ops import FrozenBatchNorm2d
+    from torchvision.ops.feature_pyramid_network import LastLevelMaxPool
 
     sizes = {"min_size": architecture.min_size, "max_size": architecture.max_size}
     if architecture.version == 2:
@@ -58,10 +67,22 @@ def build(architecture: Architecture, classes: int, *, frozen: bool = True) -> A
             raise ModelError(f"{architecture.name}: version 2 of Mask R-CNN is known with resnet50 only")
         return maskrcnn_resnet50_fpn_v2(weights=None, weights_backbone=None, num_classes=classes, **sizes)
     norm = FrozenBatchNorm2d if frozen else BatchNorm2d
-    backbone = resnet_fpn_backbone(
-        backbone_name=architecture.backbone, weights=None, norm_layer=norm, trainable_layers=5
+    width = architecture.channels
+    body = getattr(torchvision.models, architecture.backbone)(weights=None, norm_layer=norm)
+    inner = [body.inplanes // 8 << k for k in range(4)]
+    layers = {f"layer{k + 1}": str(k) for k in range(4)}
+    backbone = BackboneWithFPN(body, layers, inner, width, LastLevelMaxPool())
+    network = MaskRCNN(
+        backbone,
+        **sizes,
+        rpn_anchor_generator=AnchorGenerator(
+            tuple((architecture.anchor << k,) for k in range(5)), ((0.5, 1.0, 2.0),) * 5
+        ),
+        box_head=TwoMLPHead(width * 7**2, 4 * width),
+        box_predictor=FastRCNNPredictor(4 * width, classes),
+        mask_head=MaskRCNNHeads(width, (width,) * 4, 1),
+        mask_predictor=MaskRCNNPredictor(width, width, classes),
     )
-    network = MaskRCNN(backbone, num_classes=classes, **sizes)
     for module in network.modules():
         if isinstance(module, FrozenBatchNorm2d):
             module.eps = architecture.epsilon
@@ -83,7 +104,9 @@ def recognise(tensors: Mapping[str, Any], path: Path) -> tuple[Architecture, int
             + ("roi_heads.box_predictor.cls_score.weight" if scores is None else "a known backbone or the mask head")
         )
     version = 2 if "roi_heads.box_head.0.0.weight" in tensors else 1
-    return Architecture(backbone, version), int(scores.shape[0])
+    fpn = tensors.get("backbone.fpn.layer_blocks.0.0.weight")
+    channels = 256 if fpn is None or version == 2 else int(fpn.shape[0])
+    return Architecture(backbone, version, channels=channels), int(scores.shape[0])
 
 
 def modern_names(tensors: Mapping[str, Any]) -> dict[str, Any]:

@@ -48,7 +48,7 @@ class TorchvisionDetector:
     def __init__(self, spec: str, settings: Settings) -> None:
         self._torch = import_torch()
         path = resolve_checkpoint(spec, settings)
-        network, self.architecture, self.classes = load_detector_checkpoint(path, _PUBLISHED.get(_name_of(spec)))
+        network, self.architecture, self.classes = load_detector_checkpoint(path, known_architecture(spec))
         network.roi_heads.score_thresh = WEAK_THRESHOLD
         self._score_threshold = settings.score_threshold
         self._network = prepare(network, settings, self._torch)
@@ -139,6 +139,11 @@ def load_detector_checkpoint(
             "only checkpoints of semdb train bring their own names"
         )
     return network, architecture, classes
+
+
+def known_architecture(spec: str) -> Architecture | None:
+    """What the file of a published ``torchvision:NAME`` must be; None for a path."""
+    return _PUBLISHED.get(_name_of(spec))
 
 
 def image_tensor(image: ImageArray, torch: Any) -> Any:

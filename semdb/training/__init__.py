@@ -1,0 +1,1 @@
+"""Training and evaluation of detectors on COCO-format data. Needs the extra ``torch``; imports it inside functions."""

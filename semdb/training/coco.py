@@ -1,0 +1,169 @@
+"""COCO-format data: images, classes and instance masks, a subset of the classes where wanted."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from semdb.errors import TrainingError
+from semdb.types import BoolArray, ImageArray
+
+BACKGROUND = "background"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Instance:
+    """One annotated object: `label` counts in the classes of the data (1 is the first), `box` is x, y, w, h pixels."""
+
+    label: int
+    box: tuple[float, float, float, float]
+    segmentation: Any  # polygons [[x, y, ...], ...] or RLE {"size": [h, w], "counts": list or str}
+    annotation_id: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Picture:
+    """An image of the data and its objects; crowds are left out."""
+
+    image_id: int
+    path: Path
+    width: int
+    height: int
+    instances: tuple[Instance, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CocoData:
+    """`classes` starts with the background; `category_ids` are those of the file, one per class after it."""
+
+    file: Path
+    classes: tuple[str, ...]
+    category_ids: tuple[int, ...]
+    pictures: tuple[Picture, ...]
+
+
+def load_coco(folder: Path, split: str, classes: Sequence[str] | None = None) -> CocoData:
+    """``annotations/instances_SPLIT.json`` of `folder`, with images in ``SPLIT/`` (or ``images/``), as COCO has it.
+
+    `classes` keeps these only, in this order; None takes all, in the order of the file. Raises TrainingError naming
+    the file and entry for what is missing or contradicts itself.
+    """
+    file = folder / "annotations" / f"instances_{split}.json"
+    try:
+        content = json.loads(file.read_text())
+    except FileNotFoundError:
+        there = sorted(path.stem.removeprefix("instances_") for path in file.parent.glob("instances_*.json"))
+        raise TrainingError(
+            f"{file} is not there: COCO-format data have annotations/instances_SPLIT.json and their images in SPLIT/"
+            + (f"; splits in it: {', '.join(there)}" if there else "")
+        ) from None
+    except (OSError, ValueError) as error:
+        raise TrainingError(f"{file} cannot be read as JSON ({error})") from error
+    try:
+        return _parse(content, file, _image_folder(folder, split), classes)
+    except (KeyError, TypeError, ValueError) as error:
+        raise TrainingError(f"{file} is not in COCO's format: {type(error).__name__} {error}") from error
+
+
+def _image_folder(folder: Path, split: str) -> Path:
+    for candidate in (folder / split, folder / "images"):
+        if candidate.is_dir():
+            return candidate
+    raise TrainingError(f"{folder} has no folder {split}/ (nor images/) with the images of instances_{split}.json")
+
+
+def _parse(content: dict[str, Any], file: Path, images: Path, wanted: Sequence[str] | None) -> CocoData:
+    by_name = {str(category["name"]): int(category["id"]) for category in content["categories"]}
+    names = list(wanted) if wanted is not None else sorted(by_name, key=lambda name: by_name[name])
+    unknown = [name for name in names if name not in by_name]
+    if unknown:
+        raise TrainingError(f"{file} has no class {', '.join(unknown)}; it has {', '.join(sorted(by_name))}")
+    label_of = {by_name[name]: k for k, name in enumerate(names, start=1)}
+    instances: dict[int, list[Instance]] = {int(image["id"]): [] for image in content["images"]}
+    for row in content["annotations"]:
+        label = label_of.get(int(row["category_id"]))
+        if label is None or row.get("iscrowd"):
+            continue
+        if int(row["image_id"]) not in instances:
+            raise TrainingError(f"{file}: annotation {row['id']} is of image {row['image_id']}, which is not listed")
+        x, y, w, h = (float(value) for value in row["bbox"])
+        if w >= 1 and h >= 1:
+            instances[int(row["image_id"])].append(Instance(label, (x, y, w, h), row["segmentation"], int(row["id"])))
+    pictures = tuple(
+        Picture(
+            int(image["id"]),
+            images / image["file_name"],
+            int(image["width"]),
+            int(image["height"]),
+            tuple(instances[int(image["id"])]),
+        )
+        for image in content["images"]
+    )
+    if not pictures:
+        raise TrainingError(f"{file} lists no image")
+    return CocoData(file, (BACKGROUND, *names), tuple(by_name[name] for name in names), pictures)
+
+
+def read_picture(picture: Picture) -> ImageArray:
+    """The RGB image ``[H, W, 3]``. Raises TrainingError when it cannot be read or has another size than listed."""
+    image = cv2.imread(str(picture.path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise TrainingError(f"{picture.path} (image {picture.image_id}) is not there or is no image")
+    if image.shape[:2] != (picture.height, picture.width):
+        found = f"{image.shape[1]}x{image.shape[0]}"
+        raise TrainingError(f"{picture.path} is {found}, but its entry says {picture.width}x{picture.height}")
+    return np.ascontiguousarray(image[..., ::-1])
+
+
+def mask_of(instance: Instance, picture: Picture) -> BoolArray:
+    """The mask ``[H, W]`` of an instance. Raises TrainingError when it fits no format of COCO or not the image."""
+    segmentation = instance.segmentation
+    shape = (picture.height, picture.width)
+    try:
+        if isinstance(segmentation, list):
+            polygons = [np.asarray(p, dtype=np.float64).reshape(-1, 2) for p in segmentation]
+            mask = np.zeros(shape, dtype=np.uint8)
+            cv2.fillPoly(mask, [np.rint(p * 16).astype(np.int32) for p in polygons], 1, shift=4)
+            return mask.astype(np.bool_)
+        if tuple(segmentation["size"]) != shape:
+            raise ValueError(f"its size is {segmentation['size']}")
+        counts = segmentation["counts"]
+        return decode_rle(_uncompressed(counts) if isinstance(counts, str) else counts, shape)
+    except (KeyError, TypeError, ValueError, cv2.error) as error:
+        raise TrainingError(
+            f"{picture.path}: the mask of annotation {instance.annotation_id} is broken ({error})"
+        ) from error
+
+
+def decode_rle(counts: Sequence[int], shape: tuple[int, int]) -> BoolArray:
+    """The mask ``[H, W]`` of run lengths, column by column, zeros first. Raises ValueError when they do not fill it."""
+    runs: npt.NDArray[np.int64] = np.asarray(counts, dtype=np.int64)
+    if runs.sum() != shape[0] * shape[1] or (runs < 0).any():
+        raise ValueError(f"runs of {runs.sum()} pixels for {shape[0] * shape[1]}")
+    flat = np.repeat(np.arange(len(runs)) % 2 == 1, runs)
+    mask: BoolArray = np.ascontiguousarray(flat.reshape(shape, order="F"))
+    return mask
+
+
+def _uncompressed(text: str) -> list[int]:
+    """The run lengths of COCO's compressed string: groups of five bits, from the third run on as differences."""
+    runs: list[int] = []
+    position = 0
+    while position < len(text):
+        value, shift, more = 0, 0, True
+        while more:
+            code = ord(text[position]) - 48
+            value |= (code & 0x1F) << shift
+            more = bool(code & 0x20)
+            position, shift = position + 1, shift + 5
+            if not more and code & 0x10:
+                value |= -1 << shift
+        runs.append(value + (runs[-2] if len(runs) > 2 else 0))
+    return runs
