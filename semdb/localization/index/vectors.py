@@ -18,6 +18,8 @@ from semdb.types import Float32Array, FloatArray, Int64Array
 
 DROP_AFTER = 128 * 2**20  # bytes of a mapped file after which its pages leave the memory of this process
 
+PIECE = 4096  # rows that are looked at together
+
 
 @dataclass(slots=True, eq=False)
 class Part:
@@ -52,9 +54,13 @@ class Part:
 
     def cosines(self, rows: Int64Array, vector: Float32Array) -> FloatArray:
         """Exact cosines float64 ``[n]`` of these rows with `vector` ``[d]``."""
-        if self.bounded and self.file is not None:
-            return exact_cosines(self.take(rows), np.arange(len(rows)), vector)
-        return exact_cosines(self.array, rows, vector)
+        if not self.bounded or self.file is None:
+            return exact_cosines(self.array, rows, vector)
+        out = np.empty(len(rows), np.float64)
+        for start in range(0, len(rows), PIECE):
+            piece = self.take(rows[start : start + PIECE])
+            out[start : start + PIECE] = exact_cosines(piece, np.arange(len(piece)), vector)
+        return out
 
     def passed(self, rows: int) -> None:
         """Counts what was read in order. Pages count as memory of this process until they are given back."""
@@ -100,7 +106,7 @@ class Vectors:
             out[inside] = part.take(rows[inside] - start)
         return out
 
-    def chunks(self, first: int = 0, size: int = 4096) -> Iterator[tuple[int, Float32Array]]:
+    def chunks(self, first: int = 0, size: int = PIECE) -> Iterator[tuple[int, Float32Array]]:
         """Row number and rows of pieces that cover everything from the row `first` on."""
         for part, start in zip(self.parts, self.starts(), strict=False):
             for begin in range(max(0, first - start), len(part), size):
