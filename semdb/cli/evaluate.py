@@ -122,12 +122,8 @@ class Outputs:
     failed: list[Outcome] = field(default_factory=list)
 
     def add(self, outcome: Outcome) -> None:
-        from semdb.cli.progress import say
-
         if outcome.error is not None:
             self.failed.append(outcome)
-            if outcome.results or self.results:
-                say(f"{outcome.name}: not evaluated; the results so far are kept")
             return
         self.results += outcome.results
         self._write()
@@ -159,9 +155,15 @@ class Outputs:
         if self.trajectories is not None:
             say(f"wrote trajectories to {self.trajectories}; evo_ape tum NAME-truth.txt NAME.txt reads them")
         for outcome in self.failed:
-            say(f"not evaluated: {outcome.name}: {outcome.error}")
+            say(f"not evaluated: {without_name(outcome)}")
         if self.failed:
             raise typer.Exit(1)
+
+
+def without_name(outcome: Outcome) -> str:
+    """What failed and why, where the reason does not begin with its name anyway."""
+    reason = str(outcome.error)
+    return reason if reason.startswith(outcome.name) else f"{outcome.name}: {reason}"
 
 
 def first_error(failed: list[Outcome]) -> Exception:

@@ -85,7 +85,7 @@ class SiftExtractor:
         grey = np.ascontiguousarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
         keypoints, descriptors = self._extractor.extract(self._pycolmap.Bitmap.from_array(grey))
         xy = np.array([(point.x, point.y) for point in keypoints], dtype=np.float64).reshape(-1, 2)
-        vectors = np.asarray(descriptors.data).reshape(len(xy), -1).astype(np.float32)
+        vectors = np.asarray(descriptors.data, dtype=np.float32).reshape(len(xy), 128)
         length = np.linalg.norm(vectors, axis=1, keepdims=True)
         return SiftImage(xy, np.asarray(vectors / np.maximum(length, 1e-12), dtype=np.float32))
 
@@ -221,11 +221,3 @@ def image_points(model: Any, image_id: int) -> tuple[IntArray, FloatArray]:
             rows.append(row)
             points.append(model.points3D[point.point3D_id].xyz)
     return np.array(rows, dtype=np.int32), np.array(points, dtype=np.float64).reshape(-1, 3)
-
-
-def poses_of(model: Any, count: int) -> FloatArray:
-    """``world_from_camera`` ``[n, 4, 4]`` of the images 1 to `count`."""
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    for i in range(count):
-        poses[i, :3] = model.images[i + 1].cam_from_world().inverse().matrix()
-    return poses

@@ -86,6 +86,16 @@ METHODS = {
         Method(SIFT_REFERENCE, "the five keyframes nearest in true pose, SIFT 1500, ratio 0.85, LO-RANSAC"),
         Method(ORACLE, "semdb's fine step on the five keyframes nearest in true pose"),
         Method(COLMAP, "COLMAP: SIFT, all keyframes matched, points triangulated with known poses, LO-RANSAC"),
+        Method(
+            "semdb-counts",
+            "as semdb with class scores from counted objects, without scores of detections and without layout",
+            LocalizerOptions(coarse=CoarseOptions(scoring=Scoring.COUNTS)),
+        ),
+        Method(
+            "semdb-no-confusion",
+            "as semdb with a class standing for itself only, not for those it is taken for",
+            LocalizerOptions(coarse=CoarseOptions(confusion=0.0)),
+        ),
         Method("hard", "as semdb with the hard class filter alone", LocalizerOptions(coarse=_HARD)),
         Method(
             "cnn-objects",
@@ -111,6 +121,8 @@ ABLATION = (
     ("no filter", "all", "cnn"),
     ("hard filter", "all", "hard"),
     ("cascade", "all", SEMDB),
+    ("cascade, counts only", "all", "semdb-counts"),
+    ("cascade, no confusion", "all", "semdb-no-confusion"),
     ("no filter", "on objects", "cnn-objects"),
     ("hard filter", "on objects", "hard-objects"),
     ("cascade", "on objects", "semdb-objects"),

@@ -1,8 +1,8 @@
 """Poses of a recording made better by structure from motion, to see how far its own can be trusted.
 
 Given poses come from a depth tracker or from motion capture; images show them to be off by millimetres to
-centimetres. Bundle adjustment of all images (pycolmap) gives poses that agree with the pixels. They are brought back
-to the given world frame by one similarity, so that only what varies from frame to frame differs.
+centimetres. Bundle adjustment of all images and their depth (pycolmap) gives poses that agree with the pixels. They
+are brought back to the given world frame by one similarity, so that only what varies from frame to frame differs.
 """
 
 from __future__ import annotations
@@ -14,11 +14,13 @@ from itertools import pairwise
 import numpy as np
 
 from semdb.errors import RecordingError
-from semdb.evaluation.colmap import PosedImages, SiftExtractor, image_points, load_pycolmap, poses_of
+from semdb.evaluation.baselines import points_at
+from semdb.evaluation.colmap import HALF_PIXEL, PosedImages, SiftExtractor, image_points
+from semdb.evaluation.rgbd_bundle import adjust
 from semdb.geometry import pose_distances, pose_error, pose_from, project_to_so3
-from semdb.types import BoolArray, Camera, FloatArray, ImageArray
+from semdb.types import BoolArray, Camera, Float32Array, FloatArray, ImageArray
 
-ROUNDS = 3  # of triangulation with the poses so far and bundle adjustment
+ROUNDS = 2  # of triangulation with the poses so far and bundle adjustment
 NEAREST = 4  # pairs of every frame with those nearest in pose
 SPREAD = 8  # and with others at growing distance
 FARTHEST = 3.0  # of `pose_distances`: what is farther apart hardly sees the same
@@ -31,19 +33,24 @@ Progress = Callable[[str, int, int], None]
 class Refinement:
     """`world_from_camera` ``[n, 4, 4]`` in the given world frame; where not `refined` ``[n]``, the given pose.
 
-    `scale` is what the reconstruction was multiplied by; `points` and `reprojection_px` describe it.
+    `scale` is what the reconstruction was multiplied by: near 1 where depth and given poses agree on the metre.
+    `given_px` and `refined_px` are mean reprojection errors of points triangulated with the poses of each.
     """
 
     world_from_camera: FloatArray
     refined: BoolArray
     scale: float
     points: int
-    reprojection_px: float
+    given_px: float
+    refined_px: float
 
 
 @dataclass(frozen=True, slots=True)
 class Disagreement:
-    """How far the given poses are from the refined ones, over the refined frames, and between neighbours in time."""
+    """How far the given poses are from the refined ones, over the refined frames, and between neighbours in time.
+
+    `scale`, `given_px` and `refined_px` are those of the `Refinement`.
+    """
 
     frames: int
     refined: int
@@ -55,6 +62,9 @@ class Disagreement:
     max_rotation_deg: float
     median_step_translation_m: float | None  # of the motion from one refined frame to the next
     median_step_rotation_deg: float | None
+    scale: float
+    given_px: float
+    refined_px: float
 
 
 def choose_pairs(world_from_camera: FloatArray) -> list[tuple[int, int]]:
@@ -94,40 +104,57 @@ def align_poses(poses: FloatArray, reference: FloatArray) -> tuple[FloatArray, f
 
 def refine_poses(
     cameras: Sequence[Camera],
-    images: Callable[[int], ImageArray],
+    frames: Callable[[int], tuple[ImageArray, Float32Array | None]],
     given: FloatArray,
     *,
     name: str = "",
     progress: Progress | None = None,
 ) -> Refinement:
-    """Bundle adjustment of all frames from their `given` poses ``[n, 4, 4]``; `images` gives the frame at a position.
+    """Bundle adjustment of all frames from their `given` poses ``[n, 4, 4]``.
 
-    Cameras stay as they are: only poses and points move. Raises ModelError without pycolmap and RecordingError
-    where fewer than three frames see enough common points.
+    `frames` gives image ``[H, W, 3]`` and depth ``[H, W]`` (or None) at a position. Cameras stay as they are: only
+    poses and points move. Raises ModelError without pycolmap and RecordingError where fewer than three frames see
+    enough common points.
     """
-    extractor = SiftExtractor()
-    described = []
-    for i in range(len(given)):
-        described.append(extractor.extract(images(i)))
-        _tell(progress, f"SIFT of {name}", i + 1, len(given))
-    posed = PosedImages(cameras, described)
+    posed, points = _describe(cameras, frames, len(given), name, progress)
     posed.match(choose_pairs(given), lambda done, total: _tell(progress, f"matching {name}", done, total))
     poses = given
-    for done in range(1, ROUNDS + 1):
+    errors = []
+    for done in range(ROUNDS + 1):
         model = posed.triangulate(poses)
-        if model.num_points3D() < MIN_POINTS:
-            raise _nothing_common(name, int(model.num_points3D()))
-        _adjust(model)
-        poses = poses_of(model, len(given))
-        seen = np.array([len(image_points(model, i + 1)[0]) for i in range(len(given))])
-        _tell(progress, f"bundle adjustment of {name}", done, ROUNDS)
-    refined = seen >= MIN_POINTS
+        found = int(model.num_points3D())
+        if found < MIN_POINTS:
+            raise _nothing_common(name, found)
+        errors.append(float(model.compute_mean_reprojection_error()))
+        if done < ROUNDS:
+            poses = adjust(model, posed, points)
+        _tell(progress, f"bundle adjustment of {name}", done + 1, ROUNDS + 1)
+    refined = np.array([len(image_points(model, i + 1)[0]) for i in range(len(given))]) >= MIN_POINTS
     if refined.sum() < 3:
-        raise _nothing_common(name, int(model.num_points3D()))
+        raise _nothing_common(name, found)
     aligned, scale = align_poses(poses[refined], given[refined])
     result = given.copy()
     result[refined] = aligned
-    return Refinement(result, refined, scale, int(model.num_points3D()), float(model.compute_mean_reprojection_error()))
+    return Refinement(result, refined, scale, found, errors[0], errors[-1])
+
+
+def _describe(
+    cameras: Sequence[Camera],
+    frames: Callable[[int], tuple[ImageArray, Float32Array | None]],
+    count: int,
+    name: str,
+    progress: Progress | None,
+) -> tuple[PosedImages, list[FloatArray]]:
+    """SIFT of all frames, and the camera-frame points ``[k, 3]`` of its keypoints from depth."""
+    extractor = SiftExtractor()
+    described, points = [], []
+    for i in range(count):
+        image, depth = frames(i)
+        described.append(extractor.extract(image))
+        xy = (described[-1].xy - HALF_PIXEL).astype(np.float32)
+        points.append(np.full((len(xy), 3), np.nan) if depth is None else points_at(xy, depth, cameras[i]))
+        _tell(progress, f"SIFT of {name}", i + 1, count)
+    return PosedImages(cameras, described), points
 
 
 def disagreement(given: FloatArray, refinement: Refinement) -> Disagreement:
@@ -153,20 +180,10 @@ def disagreement(given: FloatArray, refinement: Refinement) -> Disagreement:
         max_rotation_deg=float(degrees.max()),
         median_step_translation_m=float(np.median(steps[:, 0])) if len(steps) else None,
         median_step_rotation_deg=float(np.median(steps[:, 1])) if len(steps) else None,
+        scale=refinement.scale,
+        given_px=refinement.given_px,
+        refined_px=refinement.refined_px,
     )
-
-
-def _adjust(model: object) -> None:
-    pycolmap = load_pycolmap()
-    options = pycolmap.BundleAdjustmentOptions()
-    options.refine_focal_length = False
-    options.refine_extra_params = False
-    options.refine_principal_point = False
-    options.print_summary = False
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = 1.0
-    options.ceres.solver_options.num_threads = 1
-    pycolmap.bundle_adjustment(model, options)
 
 
 def _nothing_common(name: str, points: int) -> RecordingError:

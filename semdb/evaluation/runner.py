@@ -99,13 +99,15 @@ def evaluate_each(
             plans += opening()
         except SemdbError as error:
             if say is not None:
-                say(f"not evaluated: {error}")
+                say(f"{name} is not evaluated: {error}")
             yield Outcome(name, error=error)
     for plan in plans:
         for keyframes in options.keyframes:
             try:
                 results = _evaluate_plan(plan, keyframes, methods, settings, options, progress, say)
             except SemdbError as error:
+                if say is not None:
+                    say(f"{plan.name} is not evaluated: {error}")
                 yield Outcome(plan.name, error=error)
             else:
                 yield Outcome(plan.name, tuple(results))

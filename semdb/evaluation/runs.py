@@ -16,7 +16,6 @@ from semdb.evaluation.metrics import QueryResult, query_result, with_reach
 from semdb.evaluation.retrieval import FIRST, reach
 from semdb.evaluation.tasks import Part, Task
 from semdb.ingest import IngestOptions, ingest_recording
-from semdb.localization.coarse import cascade
 from semdb.localization.localizer import Localizer
 from semdb.localize import make_localizer
 from semdb.perception.describe import Describer, describer_from_specs
@@ -141,15 +140,9 @@ class LocalizerRun(Run):
 
     def order(self, frame: Frame, localization: Localization, described: Described) -> list[int]:
         description, _ = self.describe(frame, described)
-        counts = {name: float(count) for name, count in description.category_counts.items()}
-        ids: list[int] = []
-        batches = cascade(self._localizer.source, counts, description.cnn_vector, self._localizer.options.coarse)
-        for batch in batches:
-            ids += [proposal.keyframe_id for proposal in batch.proposals]
-            if len(ids) >= max(FIRST):
-                break
+        ids = [proposal.keyframe_id for proposal in self._localizer.retrieve(description, max(FIRST))]
         position = {keyframe_id: at for at, keyframe_id in enumerate(self._ids)}
-        return [position[keyframe_id] for keyframe_id in ids[: max(FIRST)]]
+        return [position[keyframe_id] for keyframe_id in ids if keyframe_id in position]
 
     def position_of(self, keyframe_id: int | None) -> int | None:
         return self._ids.index(keyframe_id) if keyframe_id in self._ids else None

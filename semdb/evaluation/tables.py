@@ -185,12 +185,18 @@ def truth_grids(results: Sequence[EvaluationResult]) -> list[Grid]:
             errors(found.p90_translation_m, found.p90_rotation_deg),
             errors(found.max_translation_m, found.max_rotation_deg),
             errors(found.median_step_translation_m, found.median_step_rotation_deg),
+            f"{found.given_px:.2f} / {found.refined_px:.2f}",
+            f"{found.scale:.4f}",
         )
         for recording, found in first.items()
         if found is not None
     ]
-    headers = ("recording", "refined frames", "median m / °", "90 % m / °", "largest m / °", "frame to frame m / °")
-    note = "How far the given poses of the frames are from those that structure from motion finds."
+    errors_of = ("median m / °", "90 % m / °", "largest m / °", "frame to frame m / °")
+    headers = ("recording", "refined frames", *errors_of, "pixels given / refined", "scale")
+    note = (
+        "How far the given poses of the frames are from those that bundle adjustment finds; pixels: mean reprojection "
+        "error of points triangulated with the poses of each; scale: metres of the given poses per metre of depth."
+    )
     errors_rows = []
     for result in compared:
         other = result.other_errors

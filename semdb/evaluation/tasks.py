@@ -165,11 +165,11 @@ def refine_truth(task: Task, *, both: bool, progress: Progress | None) -> list[T
     given = np.stack([entry.world_from_camera for _, entry in rows if entry.world_from_camera is not None])
     cameras: list[Camera] = [recording.camera for recording, _ in rows]
 
-    def image(i: int) -> ImageArray:
+    def frame(i: int) -> tuple[ImageArray, Float32Array | None]:
         recording, entry = rows[i]
-        return recording.read_image(entry)
+        return recording.read_image(entry), recording.read_depth(entry)
 
-    found = refine_poses(cameras, image, given, name=task.name, progress=progress)
+    found = refine_poses(cameras, frame, given, name=task.name, progress=progress)
     old = {_key(*row): pose for row, pose in zip(rows, given, strict=True)}
     new = {
         _key(*row): pose for row, pose, good in zip(rows, found.world_from_camera, found.refined, strict=True) if good

@@ -19,7 +19,8 @@ from semdb.errors import UsageError
 from semdb.evaluation.averages import averages
 from semdb.evaluation.comparisons import table_1, table_3, table_4
 from semdb.evaluation.failures import explain, sharpness
-from semdb.evaluation.metrics import EvaluationResult, QueryResult, summarise
+from semdb.evaluation.methods import ABLATION
+from semdb.evaluation.metrics import EvaluationResult, QueryResult, error_figures, summarise
 from semdb.evaluation.plots import (
     SERIES,
     cumulative_plot,
@@ -30,6 +31,7 @@ from semdb.evaluation.plots import (
     trajectory_plot,
 )
 from semdb.evaluation.published import PAPER_TABLE_3
+from semdb.evaluation.refined_truth import Disagreement
 from semdb.evaluation.report import write_report
 from semdb.evaluation.tables import (
     HEADERS,
@@ -247,6 +249,17 @@ def test_report_of_an_empty_result(tmp_path: Path) -> None:
     page = write_report(tmp_path, [EMPTY])
     assert json.loads((tmp_path / "results.json").read_text())["success_rate"] is None
     assert "none, 9 keyframes" in page.read_text(encoding="utf-8")
+
+
+def test_report_of_an_ablation_and_two_truths(tmp_path: Path) -> None:
+    figures = Disagreement(14, 13, 0.01, 0.02, 0.03, 0.1, 0.2, 0.3, 0.004, 0.05, 1.001, 1.5, 0.6)
+    results = [replace(EMPTY, method=name) for _, _, name in ABLATION]
+    results[0] = replace(results[0], disagreement=figures, other_errors=error_figures([query(1, 0.02)]))
+    text = write_report(tmp_path, results).read_text(encoding="utf-8")
+    assert "What each layer brings" in text
+    assert "Ablation on room, 9 keyframes, 0 queries" in text
+    assert "<td>1.50 / 0.60</td>" in text
+    assert "<td>0.0200 / 0.40</td><td>100.0 %</td>" in text
 
 
 def test_report_errors_say_what_is_wrong(tmp_path: Path) -> None:

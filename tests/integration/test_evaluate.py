@@ -1,0 +1,203 @@
+"""`semdb evaluate` as a person runs it: what fails alone, splits, trajectories for evo, COLMAP, leftover schemas."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from sqlalchemy import text
+
+from semdb.database.engine import make_engine
+from semdb.evaluation.workspace import drop_abandoned, new_name, this_host
+from semdb.recordings.synthetic import SyntheticOptions, write_synthetic_recording
+from tests.rooms import SMALL, semdb
+from tests.unit.onnx_files import write_constant_model
+from tests.unit.recording_miniatures import write_seven_scenes
+
+URL = "sqlite:///unused.sqlite3"
+FEW = ("--keyframes", 8, "--max-queries", 4)
+
+
+def evaluate(*arguments: object, cwd: Path, code: int = 0, **settings: str) -> str:
+    """Runs the command in `cwd`, checks its exit code, and returns stderr."""
+    done = semdb("evaluate", *arguments, url=URL, cwd=cwd, **settings)
+    assert done.returncode == code, done.stderr
+    assert "Traceback" not in done.stderr
+    return done.stdout + done.stderr
+
+
+def read(path: Path) -> Any:
+    return json.loads(path.read_text())
+
+
+def chair_everywhere(path: Path) -> str:
+    """The spec of a detector that sees one chair in every image of 640x480."""
+    masks = np.zeros((1, 1, 480, 640), np.float32)
+    masks[:, :, 80:400, 120:520] = 1
+    outputs = {
+        "boxes": np.array([[120, 80, 519, 399]], np.float32),
+        "labels": np.array([62], np.int64),
+        "scores": np.array([0.9], np.float32),
+        "masks": masks,
+    }
+    return f"onnx:{write_constant_model(path, outputs)}"
+
+
+def test_one_recording_that_fails_costs_no_other_its_results(room: Path, tmp_path: Path) -> None:
+    short = tmp_path / "short"
+    shutil.copytree(room, short)
+    for name in ("rgb.txt", "depth.txt"):
+        lines = [line for line in (short / name).read_text().splitlines() if not line.startswith("#")]
+        (short / name).write_text("\n".join(lines[:5]) + "\n")
+    output = evaluate(
+        *(short, room, tmp_path / "missing", *FEW, "--json", "all.json", "--report", "report"), cwd=tmp_path, code=1
+    )
+    [result] = read(tmp_path / "all.json")
+    assert (result["recording"], result["keyframes"], result["queries"]) == (room.name, 8, 4)
+    assert "not evaluated: short: " in output
+    assert "8 keyframes were asked for, but only 5 frames can be used" in output
+    assert f"not evaluated: {tmp_path / 'missing'}: no such folder" in output
+    page = (tmp_path / "report" / "index.html").read_text()
+    assert "<b>short</b> was not evaluated" in page
+    assert page.count("data:image/jpeg") == 4  # all queries are among the ten to look at
+
+
+def test_nothing_evaluated_is_the_error_itself(tmp_path: Path) -> None:
+    output = evaluate(tmp_path / "missing", tmp_path / "gone", "--json", "none.json", cwd=tmp_path, code=1)
+    assert "missing: no such folder" in output
+    assert not (tmp_path / "none.json").exists()
+
+
+@pytest.fixture(scope="module")
+def second_visit(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("again") / "second"
+    options = {name: getattr(SMALL, name) for name in ("width", "height", "lap_frames")}
+    write_synthetic_recording(folder, SyntheticOptions(frames=10, second_visit=True, **options))
+    return folder
+
+
+def test_a_second_visit_is_asked_about_the_first(room: Path, second_visit: Path, tmp_path: Path) -> None:
+    evaluate(
+        *("--map-from", room, "--query-from", second_visit, "--keyframes", 12, "--max-queries", 6),
+        *("--method", "semdb", "--method", "semdb+depth", "--json", "split.json", "--trajectories", "poses"),
+        cwd=tmp_path,
+    )
+    plain, deep = read(tmp_path / "split.json")
+    assert (plain["protocol"], plain["recording"]) == ("split", "second")
+    assert (plain["map_recordings"], plain["query_recordings"]) == ([room.name], ["second"])
+    assert (plain["keyframes"], plain["queries"], plain["frames"]) == (12, 6, 34)
+    assert {query["recording"] for query in plain["per_query"]} == {"second"}
+    assert {query["candidate_recording"] for query in plain["per_query"]} <= {room.name, None}
+    assert plain["localized"] >= 3
+    assert plain["false_localizations"] == 0
+    assert plain["median_translation_m"] < 0.05
+    assert (plain["query_depth"], deep["query_depth"]) == (False, True)
+    assert plain["retrieval"]["queries"] >= 3
+    assert (tmp_path / "poses" / "second-semdb+depth-12.txt").is_file()
+
+
+def test_evo_reads_the_trajectories_and_finds_the_same_error(room: Path, tmp_path: Path) -> None:
+    evaluate(
+        *(room, "--keyframes", 8, "--json", "r.json", "--trajectories", "poses", "--method", "sift-reference"),
+        cwd=tmp_path,
+    )
+    result = read(tmp_path / "r.json")
+    stem = f"{room.name}-sift-reference-8"
+    evo = Path(sys.executable).with_name("evo_ape")
+    command = [evo, "tum", f"poses/{stem}-truth.txt", f"poses/{stem}.txt"]
+    environment = {"HOME": str(tmp_path), "PATH": "/usr/bin:/bin", "MPLBACKEND": "agg"}
+    for relation, mean, median in (
+        ("trans_part", "mean_translation_m", "median_translation_m"),
+        ("angle_deg", "mean_rotation_deg", "median_rotation_deg"),
+    ):
+        done = subprocess.run(
+            [*command, "--pose_relation", relation], cwd=tmp_path, env=environment, capture_output=True, text=True,
+            timeout=120, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stdout + done.stderr
+        rows = [line.split() for line in done.stdout.splitlines()]
+        figures = {row[0]: float(row[1]) for row in rows if len(row) == 2 and row[0] in ("mean", "median")}
+        assert figures["mean"] == pytest.approx(result[mean], abs=2e-6)
+        assert figures["median"] == pytest.approx(result[median], abs=2e-6)
+
+
+def test_a_scene_of_7_scenes_by_its_split_files(tmp_path: Path) -> None:
+    for number in (1, 2):
+        write_seven_scenes(tmp_path / "box" / f"seq-0{number}", n=3)
+    (tmp_path / "box" / "TrainSplit.txt").write_text("sequence1\n")
+    (tmp_path / "box" / "TestSplit.txt").write_text("sequence2\n")
+    split = ("box", "--protocol", "split", "--method", "sift-reference", "--json", "box.json")
+    evaluate(*split, cwd=tmp_path, SEMDB_ENCODER="gist", SEMDB_DETECTOR=chair_everywhere(tmp_path / "chair.onnx"))
+    result = read(tmp_path / "box.json")
+    assert (result["recording"], result["protocol"], result["queries"]) == ("box", "split", 3)
+    assert (result["map_recordings"], result["query_recordings"]) == (["box-seq-01"], ["box-seq-02"])
+    assert [query["frame_index"] for query in result["per_query"]] == [0, 4, 8]
+    output = evaluate("box", cwd=tmp_path, code=2, SEMDB_ENCODER="gist", SEMDB_DETECTOR="recorded")
+    assert "masks" in output  # the sequences are there, but `recorded` needs masks
+
+
+def test_the_ablation_has_a_row_for_every_layer(room: Path, tmp_path: Path) -> None:
+    output = evaluate(room, *FEW, "--ablation", "--json", "a.json", cwd=tmp_path)
+    results = read(tmp_path / "a.json")
+    assert [result["method"] for result in results] == [
+        "cnn", "hard", "semdb", "semdb-counts", "semdb-no-confusion", "cnn-objects", "hard-objects", "semdb-objects",
+    ]  # fmt: skip
+    assert {result["queries"] for result in results} == {4}
+    assert "Ablation on" in output
+    by_name = {result["method"]: result for result in results}
+    assert by_name["cnn"]["ranked_share"] == 1.0
+    assert by_name["hard"]["ranked_share"] <= by_name["semdb"]["ranked_share"] <= 1.0
+
+
+def test_colmap_and_both_truths(room: Path, tmp_path: Path) -> None:
+    output = evaluate(
+        *(room, "--keyframes", 10, "--max-queries", 4, "--method", "semdb", "--method", "colmap"),
+        *("--truth", "both", "--json", "c.json"),
+        cwd=tmp_path,
+    )
+    results = read(tmp_path / "c.json")
+    assert [(result["method"], result["truth"]) for result in results] == [
+        ("semdb", "given"), ("colmap", "given"), ("semdb", "refined"), ("colmap", "refined"),
+    ]  # fmt: skip
+    first = results[0]["disagreement"]
+    assert first["frames"] == 14
+    assert first["median_translation_m"] < 0.02  # the truth of a rendered room is exact: what is left is refinement's
+    assert first["scale"] == pytest.approx(1.0, abs=0.02)
+    for result in results[:2]:
+        other = result["other_errors"]
+        assert abs(other["median_translation_m"] - result["median_translation_m"]) < 0.02
+    colmap = results[1]
+    assert colmap["localized"] >= 3
+    assert colmap["median_translation_m"] < 0.02
+    assert colmap["models"]["features"]["name"] == "colmap-sift"
+    assert "Errors against both truths" in output
+
+
+def test_schemas_that_killed_evaluations_left_behind_are_dropped(mariadb_url: str) -> None:
+    host = this_host()
+    mine, foreign = f"semdb_evaluate_{host}_4194999_1700000000_abcdef", "semdb_evaluate_00000000_7_1700000000_abcdef"
+    running = new_name()
+    names = (mine, foreign, running)
+    engine = make_engine(mariadb_url)
+    try:
+        with engine.connect() as connection:
+            for name in names:
+                connection.execute(text(f"CREATE DATABASE {name}"))
+        lines = drop_abandoned(mariadb_url)
+        with engine.connect() as connection:
+            left = {row[0] for row in connection.execute(text("SHOW DATABASES"))}
+        assert left.intersection(names) == {foreign, running}
+        assert len(lines) == 2
+        assert f"dropped {mine}" in lines[0] + lines[1]
+        assert f"DROP DATABASE {foreign}" in lines[0] + lines[1]
+    finally:
+        with engine.connect() as connection:
+            for name in names:
+                connection.execute(text(f"DROP DATABASE IF EXISTS {name}"))
+        engine.dispose()
