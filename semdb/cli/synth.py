@@ -29,6 +29,12 @@ def command(
     ] = False,
     rooms: Annotated[int, typer.Option(help="With --coco: rooms, from --room-seed on, each with --frames images.")] = 1,
     split: Annotated[str, typer.Option(help="With --coco: name of the split.")] = "train",
+    missed: Annotated[
+        float, typer.Option(metavar="0..1", help="Share of the objects of a frame that the masks lack.")
+    ] = 0.0,
+    confused: Annotated[
+        float, typer.Option(metavar="0..1", help="Share of them that go by the name of a class like theirs.")
+    ] = 0.0,
     person: Annotated[bool, typer.Option("--person", help="Somebody walks to and fro before the camera.")] = False,
 ) -> None:
     """Render a furnished room as a recording.
@@ -51,6 +57,8 @@ def command(
         second_visit=second_visit,
         lap_frames=lap_frames,
         person=person,
+        missed=missed,
+        confused=confused,
     )
     if coco:
         with Progress("rendering", unit="images") as progress:
