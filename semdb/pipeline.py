@@ -25,10 +25,10 @@ def overlapped(items: Iterable[Any], stages: Sequence[Stage], window: int) -> It
 
     At most `window` items are under way, so memory does not grow with their number. A stage with one thread works
     on the items in their order, whatever the times of the others: a stage that writes does so as if everything were
-    done in turn. The first error that a stage raises ends all: items behind it are dropped, those that a stage
-    is busy with are finished, and the error is raised here. Leaving the iterator early does the same.
+    done in turn. The first error that a stage raises ends all and is raised here: stages finish what they are busy
+    with, everything else that is under way is dropped. Leaving the iterator early does the same.
     """
-    stop = threading.Event()
+    stop = _Stop()
     under_way: deque[Future[Any]] = deque()
     with ExitStack() as stack:
         pools = [
@@ -45,14 +45,37 @@ def overlapped(items: Iterable[Any], stages: Sequence[Stage], window: int) -> It
         for item in items:
             under_way.append(_enter(item, stages, pools, stop))
             while len(under_way) >= window or (under_way and under_way[0].done()):
-                yield under_way.popleft().result()
+                yield stop.result(under_way.popleft())
         while under_way:
-            yield under_way.popleft().result()
+            yield stop.result(under_way.popleft())
 
 
-def _enter(
-    item: Any, stages: Sequence[Stage], pools: Sequence[ThreadPoolExecutor], stop: threading.Event
-) -> Future[Any]:
+class _Stop:
+    """Whether all is to end, and the error that it ends with."""
+
+    def __init__(self) -> None:
+        self._event = threading.Event()
+        self._errors: list[BaseException] = []
+
+    def set(self, error: BaseException | None = None) -> None:
+        if error is not None:
+            self._errors.append(error)
+        self._event.set()
+
+    def is_set(self) -> bool:
+        return self._event.is_set()
+
+    def result(self, future: Future[Any]) -> Any:
+        """What an item became. Raises the first error of any item, also where this one was only dropped for it."""
+        try:
+            return future.result()
+        except CancelledError:
+            if self._errors:
+                raise self._errors[0] from None
+            raise
+
+
+def _enter(item: Any, stages: Sequence[Stage], pools: Sequence[ThreadPoolExecutor], stop: _Stop) -> Future[Any]:
     """Hands `item` to all stages; each waits for the one before. Returns the last one's future."""
     before: Future[Any] = Future()
     before.set_result(item)
@@ -61,12 +84,12 @@ def _enter(
     return before
 
 
-def _step(work: Callable[[Any], Any], before: Future[Any], stop: threading.Event) -> Any:
+def _step(work: Callable[[Any], Any], before: Future[Any], stop: _Stop) -> Any:
     value = before.result()
     if stop.is_set():
         raise CancelledError
     try:
         return work(value)
-    except BaseException:
-        stop.set()
+    except BaseException as error:
+        stop.set(error)
         raise

@@ -178,7 +178,7 @@ def _started(folder: Path, mariadbd: str, install: str, *, options: Sequence[str
         process.wait()
 
 
-def _install(folder: Path, install: str, user: str | None) -> None:
+def _install(folder: Path, install: str, user: str | None, options: Sequence[str] = ()) -> None:
     as_user = [f"--user={user}"] if user else []
     made = subprocess.run(
         [
@@ -187,6 +187,7 @@ def _install(folder: Path, install: str, user: str | None) -> None:
             f"--datadir={folder / 'data'}",
             f"--tmpdir={folder / 'tmp'}",
             "--skip-test-db",
+            *options,
             *as_user,
         ],
         capture_output=True,

@@ -1,0 +1,107 @@
+"""A cluster of three Galera nodes on loopback: ingest through all of them, one killed, one back and equal."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from semdb.database import schema
+from semdb.database.engine import make_engine
+from semdb.database.store import open_store
+from semdb.errors import DatabaseError
+from semdb.ingest import IngestOptions, ingest_recordings
+from semdb.recordings.synthetic import SyntheticOptions
+from semdb.settings import Settings
+from tests import servers, services
+from tests.integration.comparison import rows_per_table
+from tests.integration.test_ingest import content
+from tests.rooms import render
+
+LONGEST_GAP_S = 15.0
+FRAMES = 90
+
+
+def settings(url: str) -> Settings:
+    return Settings(database_url=url, detector="recorded", encoder="gist", features="orb", threads=1)
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[servers.Cluster]:
+    with servers.cluster() as made:
+        engine = make_engine(made.url())
+        schema.upgrade(engine)
+        engine.dispose()
+        yield made
+
+
+def test_concurrent_ingest_a_killed_node_and_its_return(
+    cluster: servers.Cluster, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = tmp_path_factory.mktemp("cluster")
+    room = render(folder / "room", SyntheticOptions(frames=FRAMES, width=96, height=72, lap_frames=90))
+    options = IngestOptions(stride=1, map_name="m")
+    undisturbed = f"sqlite:///{folder / 'a.sqlite3'}"
+    ingest_recordings([room], settings(undisturbed), options)
+
+    wrong: list[BaseException] = []
+
+    def ingest(first: int) -> None:
+        try:
+            ingest_recordings([room], settings(cluster.url(first)), options)
+        except BaseException as error:
+            wrong.append(error)
+
+    gaps: list[float] = []
+    ended = threading.Event()
+
+    def watch() -> None:
+        """The longest time in which the URL whose first node is killed answers nobody."""
+        last = time.monotonic()
+        with open_store(cluster.url(1)) as store:
+            while not ended.is_set():
+                try:
+                    store.maps()
+                except DatabaseError:
+                    continue
+                gaps.append(time.monotonic() - last)
+                last = time.monotonic()
+                time.sleep(0.02)
+
+    threads = [threading.Thread(target=ingest, args=(first,)) for first in range(3)]
+    watcher = threading.Thread(target=watch)
+    with open_store(cluster.url(0)) as store:
+        for thread in (*threads, watcher):
+            thread.start()
+        services.wait_until(lambda: bool(wrong) or rows_per_table(store)["keyframes"] >= 15, "15 keyframes")
+        cluster.nodes[1].kill()
+        for thread in threads:
+            thread.join(120)
+        ended.set()
+        watcher.join(60)
+        assert wrong == []
+        assert max(gaps) < LONGEST_GAP_S
+        with open_store(undisturbed) as expected:
+            assert content(store) == content(expected)
+    cluster.rejoin(cluster.nodes[1])
+    names = tables(cluster)
+    sums = [node.execute("SET SESSION wsrep_sync_wait = 1", f"CHECKSUM TABLE {names}") for node in cluster.nodes]
+    assert len(sums[0]) >= 15
+    assert all(value is not None for _, value in sums[0])
+    assert sums[0] == sums[1] == sums[2]
+
+
+def tables(cluster: servers.Cluster) -> str:
+    where = "table_schema = 'semdb' AND table_type = 'BASE TABLE'"
+    query = f"SELECT table_name FROM information_schema.tables WHERE {where} ORDER BY table_name"
+    return ", ".join(f"semdb.{name}" for (name,) in cluster.nodes[0].execute(query))
+
+
+def test_the_url_needs_only_one_node_that_is_alive(cluster: servers.Cluster) -> None:
+    port = services.free_port()
+    url = f"mysql+pymysql://semdb_test:{servers.PASSWORD}@127.0.0.1:{port},127.0.0.1:{cluster.nodes[2].port}/semdb"
+    with open_store(url) as store:
+        assert isinstance(store.maps(), list)
+        assert store.url == f"mysql+pymysql://semdb_test:***@127.0.0.1:{port},127.0.0.1:{cluster.nodes[2].port}/semdb"
