@@ -5,11 +5,9 @@ The score is that of `semdb.class_score`. What is here is the reference that an 
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Collection, Mapping, Sequence
-from functools import reduce
 
-from sqlalchemy import BigInteger, Connection, Engine, case, func, literal, select
+from sqlalchemy import BigInteger, Connection, Engine, func, literal, literal_column, select
 from sqlalchemy.sql.elements import ColumnElement
 
 from semdb.class_score import SCALE, ClassQuery, ClassTerm, Part, class_query
@@ -18,6 +16,11 @@ from semdb.database.records import ScoredKeyframe
 from semdb.database.tables import categories, keyframe_categories, keyframes, recordings
 
 CHUNK = 500
+_COLUMNS = {
+    Part.COUNT: "keyframe_categories.count",
+    Part.UPPER: "keyframe_categories.upper_strength",
+    Part.LOWER: "keyframe_categories.lower_strength",
+}
 
 
 def keyframe_count(engine: Engine, map_id: int) -> int:
@@ -138,17 +141,15 @@ def _scores(
 
 
 def _contribution(known: list[tuple[int, ClassTerm]]) -> ColumnElement[int]:
-    """What one row (category, keyframe) adds: the sum of ``min(full, per_object * value)`` of its parts."""
-    by_category: dict[int, list[ColumnElement[int]]] = {}
+    """What one row (category, keyframe) adds: the sum of ``min(full, per_object * value)`` of its parts.
+
+    Written out, since expressions for dozens of terms take SQLAlchemy longer to compile than servers to run. All that
+    goes into it are integers and names of columns.
+    """
+    of_category: dict[int, list[str]] = {}
     for category_id, term in known:
-        by_category.setdefault(category_id, []).append(_of_term(term))
-    values = {category_id: reduce(operator.add, terms) for category_id, terms in by_category.items()}
-    return case(values, value=keyframe_categories.c.category_id, else_=literal(0, BigInteger))
-
-
-def _of_term(term: ClassTerm) -> ColumnElement[int]:
-    c = keyframe_categories.c
-    value = {Part.COUNT: c.count, Part.UPPER: c.upper_strength, Part.LOWER: c.lower_strength}[term.part]
-    full, per_object = literal(term.full, BigInteger), literal(term.per_object, BigInteger)
-    enough = -(-term.full // term.per_object)
-    return case((value >= enough, full), else_=per_object * value)
+        value, enough = _COLUMNS[term.part], -(-term.full // term.per_object)
+        added = f"CASE WHEN {value} >= {enough:d} THEN {term.full:d} ELSE {term.per_object:d} * {value} END"
+        of_category.setdefault(int(category_id), []).append(added)
+    branches = " ".join(f"WHEN {key:d} THEN {' + '.join(added)}" for key, added in of_category.items())
+    return literal_column(f"CASE keyframe_categories.category_id {branches} ELSE 0 END", BigInteger)

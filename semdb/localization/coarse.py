@@ -42,15 +42,15 @@ class Scoring(StrEnum):
 class CoarseOptions:
     """`*_batches` are numbers of keyframes to match before asking again whether the answer convinces.
 
-    The filter passes `filtered_share` of the map's keyframes, but at least `filtered_at_least` and at most
-    `filtered_at_most`: those with the best class score.
+    The filter passes `filtered_share` of the map's keyframes, those with the best class score, but at least
+    `filtered_at_least` of them (or a third of a map so small that this is less), and at most `filtered_at_most`.
     """
 
     use_classes: bool = True
     scoring: Scoring = Scoring.STRENGTHS
     minimum_share: float = 0.0  # class score below which a keyframe does not pass in any case
     filtered_share: float = 0.15
-    filtered_at_least: int = 4
+    filtered_at_least: int = 8
     filtered_at_most: int = 1000
     class_weight: float = 0.1  # of the class score beside the cosine in the soft stage
     filtered_batches: tuple[int, ...] = (1, 2)
@@ -61,8 +61,8 @@ class CoarseOptions:
 
     def passing(self, keyframes: int) -> int:
         """How many of so many keyframes pass the filter."""
-        share = math.ceil(self.filtered_share * keyframes)
-        return min(self.filtered_at_most, max(self.filtered_at_least, share))
+        least = min(self.filtered_at_least, math.ceil(keyframes / 3))
+        return min(self.filtered_at_most, max(least, math.ceil(self.filtered_share * keyframes)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -144,10 +144,11 @@ def test_the_filter_gives_the_best_by_class_score_and_they_are_ranked_by_cosine(
 
 
 def test_a_share_of_the_map_passes_the_filter() -> None:
-    options = CoarseOptions(filtered_share=0.15, filtered_at_least=4, filtered_at_most=1000)
-    assert [options.passing(n) for n in (1, 12, 26, 27, 40, 1000, 10**6)] == [4, 4, 4, 5, 6, 150, 1000]
-    _, source = run(replace(options, filtered_at_least=1))
-    assert source.at_most == [1]
+    options = CoarseOptions(filtered_share=0.15, filtered_at_least=8, filtered_at_most=1000)
+    assert [options.passing(n) for n in (1, 12, 20, 25, 53, 54, 1000, 10**6)] == [1, 4, 7, 8, 8, 9, 150, 1000]
+    assert replace(options, filtered_share=1.0, filtered_at_most=10**9).passing(10**6) == 10**6
+    _, source = run(options)
+    assert source.at_most == [2]
 
 
 def test_by_counts_what_is_seen_weakly_is_not_asked_for() -> None:
