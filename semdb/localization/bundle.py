@@ -39,8 +39,8 @@ class MotionPrior:
     """
 
     turn_rad: float = 0.02
-    keyframe_m: float = 0.005
-    keyframe_rad: float = 0.005
+    keyframe_m: float = 0.002
+    keyframe_rad: float = 0.001
     least_turn_rad: float = 0.0003
     least_keyframe_m: float = 0.0002
     least_keyframe_rad: float = 0.0002
@@ -213,14 +213,19 @@ def _move(pose: FloatArray, step: FloatArray) -> FloatArray:
 
 
 def adjust(
-    problem: BundleProblem, camera_from_world: FloatArray, prior: MotionPrior | None = None, max_iterations: int = 15
+    problem: BundleProblem,
+    camera_from_world: FloatArray,
+    prior: MotionPrior | None = None,
+    max_iterations: int = 15,
+    *,
+    rough: bool = False,
 ) -> BundleResult:
     """Minimises equation (5) from `camera_from_world` ``[4, 4]``.
 
     It is solved twice. First the images may turn and the keyframes move as far as `prior` believes at most; then
     the variance of each of these priors is what the solution shows it to be (MacKay's evidence approximation, Neural
     Computation 4(3), 1992). So where nothing turned, no freedom is given that noise would use.
-    The query's depth joins the second time, as far as it agrees with the first solution.
+    The query's depth joins the second time, as far as it agrees with the first solution. `rough` stops after the first.
     Raises numpy.linalg.LinAlgError when the points do not determine the pose (fewer than three, or in a row).
     """
     prior = prior or MotionPrior()
@@ -233,13 +238,17 @@ def adjust(
     solver.information = _information(greatest, count)
     solver.observed[problem.observed_image == QUERY, 5] = IGNORED
     state, blocks, iterations = solver.minimise(state, FIRST_ITERATIONS)
+    if rough:
+        return _result(solver, state, blocks, iterations)
     solver.believe_depth(state)
     solver.information = _information(_evident_sigma(solver, state, blocks, least, greatest), count)
     state, blocks, more = solver.minimise(state, max_iterations)
+    return _result(solver, state, blocks, iterations + more)
+
+
+def _result(solver: _Solver, state: _State, blocks: _Blocks, iterations: int) -> BundleResult:
     covariance = _covariance(solver, blocks, state.poses[QUERY])
-    return BundleResult(
-        state.poses[QUERY], state.points, covariance, state.poses, state.turn, blocks.chi2, iterations + more
-    )
+    return BundleResult(state.poses[QUERY], state.points, covariance, state.poses, state.turn, blocks.chi2, iterations)
 
 
 def _information(sigma: FloatArray, images: int) -> FloatArray:

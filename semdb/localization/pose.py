@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import poselib
@@ -14,6 +14,7 @@ from semdb.localization.matching import Matches, MatchingOptions, match_guided, 
 from semdb.localization.views import KeyframeView, View
 from semdb.types import BoolArray, FloatArray, IntArray
 
+NEAREST_M = 0.05  # what is nearer is not in front of the camera
 MINIMUM_PAIRS = 6  # below, a pose from 3 points has nothing to be checked with
 
 
@@ -24,6 +25,7 @@ class PoseOptions:
     matching: MatchingOptions = field(default_factory=MatchingOptions)
     max_reprojection_px: float = 5.0
     inlier_px: float = 4.0
+    close_radius_px: float = 6.0  # of guided matching once images' turns are known
     pixel_sigma_px: float = 1.0
     guided: bool = True
     bundle: bool = True
@@ -105,7 +107,7 @@ def reprojection_px(query: View, camera_from_world: FloatArray, rows: IntArray, 
     with np.errstate(divide="ignore", invalid="ignore"):
         offset = moved[:, :2] / moved[:, 2:] - query.xy[rows]
     distance = np.hypot(offset[:, 0], offset[:, 1]) * query.focal
-    return np.where(moved[:, 2] > 0.05, distance, np.inf)
+    return np.where(moved[:, 2] > NEAREST_M, distance, np.inf)
 
 
 def robust_pnp(
@@ -140,30 +142,48 @@ def robust_pnp(
 
 
 def guided_pairs(
-    query: View, keyframes: Sequence[KeyframeView], camera_from_world: FloatArray, options: PoseOptions
+    query: View, keyframes: Sequence[KeyframeView], projected: Sequence[FloatArray], options: MatchingOptions
 ) -> Pairs:
-    """Second matching: only near the projections of the keyframes' points under the first pose."""
-    focal = query.focal
-    matches = []
-    for keyframe in keyframes:
-        moved = keyframe.world_points @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            projected = np.where(moved[:, 2:] > 0.05, moved[:, :2] / moved[:, 2:], np.nan) * focal
-        view = keyframe.view
-        matches.append(
+    """Second matching: only near the projections ``[n, 2]`` of each keyframe's points, in pixels from the centre."""
+    return join_pairs(
+        [
             match_guided(
                 query.descriptors,
-                view.descriptors,
-                query.xy * focal,
-                projected,
+                keyframe.view.descriptors,
+                query.xy * query.focal,
+                centres,
                 query.classes,
-                view.classes,
-                options.matching,
+                keyframe.view.classes,
+                options,
                 query_signs=query.signs,
-                keyframe_signs=view.signs,
+                keyframe_signs=keyframe.view.signs,
             )
-        )
-    return join_pairs(matches)
+            for keyframe, centres in zip(keyframes, projected, strict=True)
+        ]
+    )
+
+
+def _in_front(points: FloatArray) -> FloatArray:
+    """Normalised coordinates ``[n, 2]`` of camera-frame points, NaN where they are not in front of the camera."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(points[:, 2:] > NEAREST_M, points[:, :2] / points[:, 2:], np.nan)
+
+
+def project_adjusted(query: View, keyframes: Sequence[KeyframeView], adjusted: BundleResult) -> list[FloatArray]:
+    """Where the query sees each keyframe's points, ``[n, 2]`` pixels from the centre, NaN behind it.
+
+    All images stand and turn as `adjusted` found; the points are those measured in the keyframes.
+    """
+    projected = []
+    for slot, keyframe in enumerate(keyframes, start=1):
+        local = keyframe.view.points.astype(np.float64)
+        local -= np.cross(adjusted.turn[slot] * keyframe.view.image_row[:, None], local)
+        world = transform_points(invert_pose(adjusted.image_from_world[slot]), local)
+        seen = transform_points(adjusted.camera_from_world, world)
+        # the row that sees a point, to first order where it would be without a turn
+        row = np.clip(_in_front(seen)[:, 1:] * query.focal / query.camera.height, -0.5, 0.5)
+        projected.append(_in_front(seen + np.cross(adjusted.turn[0] * row, seen)) * query.focal)
+    return projected
 
 
 def estimate_pose(
@@ -181,7 +201,7 @@ def estimate_pose(
     camera_from_world, agreeing = found
     first = _first_support(pairs, agreeing)
     if options.guided:
-        pairs = guided_pairs(query, keyframes, camera_from_world, options)
+        pairs = guided_pairs(query, keyframes, _project(query, keyframes, camera_from_world), options.matching)
         points = world_points_of(pairs, keyframes)
         agreeing = reprojection_px(query, camera_from_world, pairs.query, points) < options.max_reprojection_px
         if agreeing.sum() < MINIMUM_PAIRS:
@@ -191,11 +211,44 @@ def estimate_pose(
         error = reprojection_px(query, camera_from_world, pairs.query, points)
         return _estimate(query, keyframes, pairs, error, camera_from_world, None, first, options)
     try:
-        refined = bundle_adjust(query, keyframes, pairs.take(agreeing), points[agreeing], camera_from_world, options)
+        pairs, error, refined = _refine(query, keyframes, pairs, points, agreeing, camera_from_world, options)
     except np.linalg.LinAlgError:
         return None
-    error = adjusted_error_px(query, keyframes, pairs, refined)
     return _estimate(query, keyframes, pairs, error, refined.camera_from_world, refined.covariance, first, options)
+
+
+def _refine(
+    query: View,
+    keyframes: Sequence[KeyframeView],
+    pairs: Pairs,
+    points: FloatArray,
+    agreeing: BoolArray,
+    camera_from_world: FloatArray,
+    options: PoseOptions,
+) -> tuple[Pairs, FloatArray, BundleResult]:
+    """Bundle adjustment; with guided matching once roughly, then again over what matches near its projections.
+
+    Returns the pairs with their errors in pixels. Raises numpy.linalg.LinAlgError where the pose is not determined.
+    """
+    adjusted = bundle_adjust(
+        query, keyframes, pairs.take(agreeing), points[agreeing], camera_from_world, options, rough=options.guided
+    )
+    if options.guided:
+        matching = replace(options.matching, guided_radius_px=options.close_radius_px)
+        pairs = guided_pairs(query, keyframes, project_adjusted(query, keyframes, adjusted), matching)
+        agreeing = adjusted_error_px(query, keyframes, pairs, adjusted) < options.inlier_px
+        if agreeing.sum() < MINIMUM_PAIRS:
+            raise np.linalg.LinAlgError("too few pairs are left")
+        points = world_points_of(pairs, keyframes)[agreeing]
+        adjusted = bundle_adjust(query, keyframes, pairs.take(agreeing), points, adjusted.camera_from_world, options)
+    return pairs, adjusted_error_px(query, keyframes, pairs, adjusted), adjusted
+
+
+def _project(query: View, keyframes: Sequence[KeyframeView], camera_from_world: FloatArray) -> list[FloatArray]:
+    """Where the query sees each keyframe's points under a pose alone, ``[n, 2]`` pixels from the centre."""
+    return [
+        _in_front(transform_points(camera_from_world, keyframe.world_points)) * query.focal for keyframe in keyframes
+    ]
 
 
 def _first_support(pairs: Pairs, agreeing: BoolArray) -> tuple[int, int, float]:
@@ -283,6 +336,8 @@ def bundle_adjust(
     points: FloatArray,
     camera_from_world: FloatArray,
     options: PoseOptions,
+    *,
+    rough: bool = False,
 ) -> BundleResult:
     """Equation (5) over the agreeing pairs. Pairs of one query keypoint with several keyframes are one point."""
     rows, point_index = np.unique(pairs.query, return_inverse=True)
@@ -308,7 +363,7 @@ def bundle_adjust(
         rows=observed[:, 4],
         keyframe_from_world=np.stack([keyframe.camera_from_world for keyframe in keyframes]),
     )
-    return adjust(problem, camera_from_world, options.motion)
+    return adjust(problem, camera_from_world, options.motion, rough=rough)
 
 
 def _observations(view: View, rows: IntArray, options: PoseOptions, *, with_depth: bool) -> FloatArray:
@@ -325,16 +380,9 @@ def adjusted_error_px(
 
     All images stand and turn as `adjusted` found; the points are those measured in the keyframes.
     """
-    points = np.empty((len(pairs), 3))
-    for slot, keyframe in enumerate(keyframes):
+    error = np.empty(len(pairs))
+    for slot, projected in enumerate(project_adjusted(query, keyframes, adjusted)):
         here = pairs.slot == slot
-        chosen = pairs.keypoint[here]
-        local = keyframe.view.points[chosen].astype(np.float64)
-        local -= np.cross(adjusted.turn[slot + 1] * keyframe.view.image_row[chosen, None], local)
-        points[here] = transform_points(invert_pose(adjusted.image_from_world[slot + 1]), local)
-    moved = transform_points(adjusted.camera_from_world, points)
-    moved += np.cross(adjusted.turn[0] * query.image_row[pairs.query, None], moved)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        offset = moved[:, :2] / moved[:, 2:] - query.xy[pairs.query]
-    distance = np.hypot(offset[:, 0], offset[:, 1]) * query.focal
-    return np.where(moved[:, 2] > 0.05, distance, np.inf)
+        offset = projected[pairs.keypoint[here]] - query.xy[pairs.query[here]] * query.focal
+        error[here] = np.hypot(offset[:, 0], offset[:, 1])
+    return np.where(np.isfinite(error), error, np.inf)
