@@ -1,12 +1,19 @@
 #!/usr/bin/env bash
-# The servers that the tests run on loopback. A test run on another server names it in SEMDB_TEST_MYSQL_URL.
+# The servers that the tests run on loopback: MariaDB with Galera, and Redis. Tests on another server name it in
+# SEMDB_TEST_MYSQL_URL; those that kill servers, and those of a cluster, need them here.
 set -euo pipefail
 PATH=$PATH:/usr/sbin:/usr/local/sbin
 
-if ! command -v mariadbd >/dev/null; then
-  if [ -n "${SEMDB_TEST_MYSQL_URL:-}" ]; then
-    echo "no MariaDB here: the tests use the server of SEMDB_TEST_MYSQL_URL"
-  elif ! "$(dirname "$0")/apt-install.sh" mariadb-server; then
+packages=()
+command -v mariadbd >/dev/null || packages+=(mariadb-server)
+[ -e /usr/lib/galera/libgalera_smm.so ] || packages+=(galera-4)
+command -v rsync >/dev/null || packages+=(rsync)
+command -v redis-server >/dev/null || packages+=(redis-server)
+
+if [ ${#packages[@]} -gt 0 ] && ! "$(dirname "$0")/apt-install.sh" "${packages[@]}"; then
+  if command -v mariadbd >/dev/null || [ -n "${SEMDB_TEST_MYSQL_URL:-}" ]; then
+    echo "not installed: ${packages[*]}; the tests that need them fail or are skipped, and say so" >&2
+  else
     echo "the tests need MariaDB: install it, or set SEMDB_TEST_MYSQL_URL to a server and an account for tests" >&2
     exit 1
   fi

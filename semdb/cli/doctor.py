@@ -38,7 +38,7 @@ def command(overrides: Overrides, json: JsonFlag = False) -> None:
     from semdb.cli.output import print_json
 
     settings = overrides.settings()
-    checks = [check for part in (versions, database, folders, models) for check in guarded(part, settings)]
+    checks = [check for part in (versions, database, broker, folders, models) for check in guarded(part, settings)]
     if json:
         print_json([{"state": check.state, "what": check.what, "text": check.text} for check in checks])
     else:
@@ -89,6 +89,7 @@ def database(settings: Settings) -> Iterator[Check]:
 
     from semdb.database import retry, schema
     from semdb.database.engine import make_engine, parse_url, safe_url, sqlite_path
+    from semdb.database.inspection import judge, server_facts
 
     url = parse_url(settings.database_url)
     path = sqlite_path(url)
@@ -103,10 +104,37 @@ def database(settings: Settings) -> Iterator[Check]:
         version = retry.read(engine, lambda connection: str(connection.execute(text(statement)).scalar()))
         kind = "SQLite" if path is not None else "server"
         yield Check("ok", "database", f"{safe_url(url)} answers: {kind} {version}")
+        if path is None:
+            for finding in judge(server_facts(engine)):
+                yield Check(finding.state, f"database: {finding.what}", finding.text)
+        elif not os.access(path, os.W_OK) or not os.access(path.absolute().parent, os.W_OK):
+            yield Check("problem", "database", f"{path} or its folder cannot be written: change their rights")
         schema.check_schema(engine)
         yield Check("ok", "schema", f"revision {schema.HEAD}")
     finally:
         engine.dispose()
+
+
+def broker(settings: Settings) -> Iterator[Check]:
+    """Whether the broker of the workers answers, where one is set."""
+    if "broker_url" not in settings.model_fields_set:
+        yield Check("info", "broker", "SEMDB_BROKER_URL is not set: only `semdb ingest --queue` and workers need it")
+        return
+    try:
+        from kombu import Connection
+        from kombu.exceptions import OperationalError
+    except ImportError:
+        yield Check(
+            "problem", "broker", "the worker extra is missing: pip install 'semdb[worker]'"
+        )
+        return
+    with Connection(settings.broker_url, connect_timeout=5) as connection:
+        where = connection.as_uri()  # without the password
+        try:
+            connection.ensure_connection(max_retries=1, timeout=5)
+            yield Check("ok", "broker", f"{where} answers")
+        except (OperationalError, OSError) as error:
+            yield Check("problem", "broker", f"{where} does not answer ({error}): start it, or set SEMDB_BROKER_URL")
 
 
 def folders(settings: Settings) -> Iterator[Check]:
