@@ -27,7 +27,9 @@ def command(
     coco: Annotated[
         bool, typer.Option("--coco", help="Instance segmentation data in COCO's format instead of a recording.")
     ] = False,
-    rooms: Annotated[int, typer.Option(help="With --coco: rooms, from --room-seed on, each with --frames images.")] = 1,
+    rooms: Annotated[
+        int, typer.Option(help="Rooms, from --room-seed on, each with --frames images, in folders of their own.")
+    ] = 1,
     split: Annotated[str, typer.Option(help="With --coco: name of the split.")] = "train",
     missed: Annotated[
         float, typer.Option(metavar="0..1", help="Share of the objects of a frame that the masks lack.")
@@ -44,6 +46,7 @@ def command(
     from semdb.cli.progress import Progress
     from semdb.recordings.synthetic import SyntheticOptions, write_synthetic_recording
     from semdb.recordings.synthetic.coco import write_synthetic_coco
+    from semdb.recordings.synthetic.writer import write_synthetic_building
 
     options = SyntheticOptions(
         frames=frames,
@@ -64,6 +67,11 @@ def command(
         with Progress("rendering", unit="images") as progress:
             write_synthetic_coco(directory, options, rooms, split, progress.update)
         print(f"wrote {rooms * frames} images of {rooms} rooms to {directory / split}")
+        return
+    if rooms > 1:
+        with Progress("rendering") as progress:
+            folders = write_synthetic_building(directory, options, rooms, progress.update)
+        print(f"wrote {rooms} recordings of {frames} frames to {folders[0]} and so on: one map for all of them")
         return
     with Progress("rendering") as progress:
         write_synthetic_recording(directory, options, progress.update)

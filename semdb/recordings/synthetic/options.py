@@ -10,6 +10,7 @@ from semdb.types import Camera
 FOCAL_PER_WIDTH = 0.82  # fx / width: 62.7 degrees from left to right, as the sensors of TUM RGB-D and 7-Scenes
 DEPTH_SCALE = 5000.0
 FRAME_RATE_HZ = 30.0
+BETWEEN_ROOMS_M = 20.0  # from the middle of one room of a building to that of the next
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +24,7 @@ class SyntheticOptions:
     With `person` somebody walks to and fro before the camera.
     Rooms to be confused with others: `furniture_seed` puts the furniture of another seed into the room, `alike` mirrors
     every texture (same shapes, same colours, another room), `desks` furnishes it with so many equal workplaces.
+    `place` numbers the rooms of a building: each next one lies 20 m further along x in the world of the poses.
     Masks as a real detector's: of the instances of every frame a share `missed` is not there, and a share `confused`
     goes by the name of a class that detectors take it for.
     """
@@ -41,6 +43,7 @@ class SyntheticOptions:
     alike: bool = False
     desks: int = 0
     person: bool = False
+    place: int = 0
     missed: float = 0.0
     confused: float = 0.0
 
@@ -57,6 +60,7 @@ class SyntheticOptions:
             ("lap_frames", 8, 1_000_000),
             ("furniture_seed", 0, 2**32 - 1),
             ("desks", 0, 8),
+            ("place", 0, 100_000),
             ("missed", 0.0, 1.0),
             ("confused", 0.0, 1.0),
         )

@@ -9,7 +9,7 @@ import shutil
 import tempfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from semdb.errors import UsageError
 from semdb.geometry import quat_wxyz_from_rotation
 from semdb.recordings.synthetic import sensor
 from semdb.recordings.synthetic.mistakes import make_mistakes, with_misnamed
-from semdb.recordings.synthetic.options import DEPTH_SCALE, FRAME_RATE_HZ, SyntheticOptions
+from semdb.recordings.synthetic.options import BETWEEN_ROOMS_M, DEPTH_SCALE, FRAME_RATE_HZ, SyntheticOptions
 from semdb.recordings.synthetic.person import CATEGORY as PERSON
 from semdb.recordings.synthetic.person import walker_for
 from semdb.recordings.synthetic.render import Lamp, bake_light, render_view
@@ -84,7 +84,8 @@ class SyntheticSequence:
         # one more pose than frames: the blur of the last frame needs where the camera goes next
         poses = walk(self.room, options.frames + 1, options.lap_frames, options.seed, options.second_visit)
         self._poses = poses
-        self.poses: FloatArray = poses[:-1]
+        self.poses: FloatArray = poses[:-1].copy()
+        self.poses[:, 0, 3] += BETWEEN_ROOMS_M * options.place
 
     @property
     def classes(self) -> dict[int, str]:
@@ -116,7 +117,7 @@ class SyntheticSequence:
         labels = view.labels
         if options.missed > 0 or options.confused > 0:
             labels = make_mistakes(labels, self._true_classes(), options.missed, options.confused, options.seed, index)
-        return SyntheticFrame(rgb, depth, labels, pose)
+        return SyntheticFrame(rgb, depth, labels, self.poses[index])
 
 
 def write_synthetic_recording(
@@ -139,6 +140,35 @@ def write_synthetic_recording(
         work.replace(target)  # an empty folder gives way, a full one does not
     finally:
         shutil.rmtree(work, ignore_errors=True)
+
+
+def write_synthetic_building(
+    directory: Path, options: SyntheticOptions, rooms: int, progress: Callable[[int, int], None] | None = None
+) -> list[Path]:
+    """Renders `rooms` rooms of different furniture into folders ``room-000``, ... of `directory`, in one world.
+
+    Their seeds go up from those of `options`. Raises UsageError for a directory that is not empty.
+    """
+    directory = Path(directory)
+    if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
+        raise UsageError(f"{directory}: is not empty; give a new or empty folder for the synthetic recordings")
+    folders = []
+    for room, room_options in enumerate(building(options, rooms)):
+
+        def show(done: int, total: int, before: int = room * options.frames) -> None:
+            if progress is not None:
+                progress(before + done, rooms * total)
+
+        folders.append(directory / f"room-{room:03d}")
+        write_synthetic_recording(folders[-1], room_options, show)
+    return folders
+
+
+def building(options: SyntheticOptions, rooms: int) -> list[SyntheticOptions]:
+    """The options of each of the rooms of a building. Raises UsageError for less than one."""
+    if rooms < 1:
+        raise UsageError(f"a building has at least one room, not {rooms}")
+    return [replace(options, room_seed=options.room_seed + k, seed=options.seed + k, place=k) for k in range(rooms)]
 
 
 def _write_all(folder: Path, sequence: SyntheticSequence, progress: Callable[[int, int], None] | None) -> None:
