@@ -1,4 +1,4 @@
-# semdb with the worker extra. docs/deployment.md says how to build and use it.
+# semdb with the extras worker and remote. docs/deployment.md says how to build and use it.
 FROM python:3.11-slim AS build
 WORKDIR /source
 RUN pip install --no-cache-dir "build>=1.2,<2" "setuptools>=80,<90"
@@ -14,7 +14,7 @@ RUN useradd --create-home --uid 1000 semdb \
     && chown semdb:semdb /data /cache
 COPY requirements/constraints.txt /tmp/constraints.txt
 COPY --from=build /dist /dist
-RUN pip install --no-cache-dir --constraint /tmp/constraints.txt "$(ls /dist/*.whl)[worker]" \
+RUN pip install --no-cache-dir --constraint /tmp/constraints.txt "$(ls /dist/*.whl)[worker,remote]" \
     && rm -rf /dist /tmp/constraints.txt
 USER semdb
 WORKDIR /data

@@ -13,6 +13,8 @@ from typing import Any
 import pytest
 import yaml
 
+from semdb.database.accounts import RIGHTS
+
 REPOSITORY = Path(__file__).resolve().parents[2]
 COMPOSE = REPOSITORY / "docker-compose.yml"
 CONDITIONS = {"service_healthy", "service_completed_successfully"}
@@ -87,7 +89,53 @@ def test_no_password_is_in_the_file_and_every_one_is_required(compose: dict[str,
             if match:
                 assert re.fullmatch(r"\$\{[A-Z_]+:\?[^}]+\}", match[1]), f"{variable} has a password in the file"
                 secrets += 1
-    assert secrets == 4  # root, user, and the user's in the URLs of migrate and worker
+    # root, owner, writer, reader; the broker's; and in the URLs of migrate (one) and worker (three)
+    assert secrets == 9
+
+
+def test_each_service_has_the_account_that_it_needs(compose: dict[str, Any]) -> None:
+    services = compose["services"]
+    assert "://semdb_owner:" in services["migrate"]["environment"]["SEMDB_DATABASE_URL"]
+    worker = services["worker"]["environment"]
+    assert "://semdb_writer:" in worker["SEMDB_DATABASE_URL"]
+    assert "://semdb_reader:" in worker["SEMDB_READER_URL"]
+    assert all("ssl_mode=REQUIRED" in worker[name] for name in ("SEMDB_DATABASE_URL", "SEMDB_READER_URL"))
+    # passwords on a command line are in the list of processes
+    for service in services.values():
+        for part in (*service.get("command", []), *service.get("healthcheck", {}).get("test", [])):
+            assert "--password" not in part
+            assert "${" not in part
+            assert not re.search(r" -p\S", part)
+
+
+def test_the_script_of_the_accounts_grants_what_semdb_does(tmp_path: Path) -> None:
+    client = tmp_path / "mysql"
+    client.write_text('#!/bin/sh\necho "$@" > "$OUT/arguments"\ncat > "$OUT/statements"\n')
+    client.chmod(0o755)
+    given = {f"SEMDB_{role.upper()}_PASSWORD": f"word{role}1" for role in RIGHTS}
+    environment = {
+        "PATH": f"{tmp_path}:{os.environ['PATH']}",
+        "OUT": str(tmp_path),
+        "MYSQL_ROOT_PASSWORD": "r",
+        **given,
+    }
+    script = REPOSITORY / "scripts" / "compose-accounts.sh"
+    subprocess.run(["bash", str(script)], env=environment, check=True, timeout=30)
+    statements = (tmp_path / "statements").read_text()
+    for role, rights in RIGHTS.items():
+        assert f"CREATE USER 'semdb_{role}'@'%' IDENTIFIED BY 'word{role}1';" in statements
+        assert f"GRANT {rights} ON semdb.* TO 'semdb_{role}'@'%';" in statements
+    assert "word" not in (tmp_path / "arguments").read_text()
+    refused = subprocess.run(
+        ["bash", str(script)],
+        env={**environment, "SEMDB_READER_PASSWORD": "it's"},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=30,
+    )
+    assert refused.returncode != 0
+    assert "letters and digits" in refused.stderr
 
 
 def test_settings_that_services_get_exist(compose: dict[str, Any]) -> None:
@@ -96,6 +144,8 @@ def test_settings_that_services_get_exist(compose: dict[str, Any]) -> None:
     known = {f"SEMDB_{name.upper()}" for name in Settings.model_fields}
     for name in ("migrate", "worker"):
         assert set(compose["services"][name]["environment"]) <= known
+    for name in ("database", "broker"):
+        assert not set(compose["services"][name]["environment"]) & known
 
 
 def test_the_dockerfile_copies_what_is_there_and_not_ignored() -> None:
@@ -110,7 +160,8 @@ def test_the_dockerfile_copies_what_is_there_and_not_ignored() -> None:
 
 
 def docker_compose(*arguments: str) -> subprocess.CompletedProcess[str]:
-    environment = {"SEMDB_DB_PASSWORD": "a", "SEMDB_DB_ROOT_PASSWORD": "b", "PATH": os.environ["PATH"]}
+    names = ("DB_ROOT", "OWNER", "WRITER", "READER", "BROKER")
+    environment = {**{f"SEMDB_{name}_PASSWORD": "a" for name in names}, "PATH": os.environ["PATH"]}
     command = ["docker", "compose", *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=False, env=environment, timeout=60)
 
