@@ -83,7 +83,7 @@ def confidence_plot(series: Sequence[tuple[str, FloatArray, BoolArray]]) -> Figu
     right.set_ylim(0, 1.02)
     right.set_xlabel("confidence")
     right.set_ylabel("share of answers that are right")
-    for axes, place in ((left, "lower left"), (right, "upper left")):
+    for axes, place in ((left, "lower left"), (right, "lower right")):
         if axes.get_legend_handles_labels()[0]:
             axes.legend(loc=place, labelcolor=INK, framealpha=1.0, edgecolor="white", fontsize=9, markerscale=0.6)
     return figure

@@ -62,4 +62,4 @@ def _end(query: QueryResult) -> str:
         return "a pose was found but not trusted"
     if query.is_false:
         return f"a wrong pose was trusted ({query.inliers} inliers)"
-    return f"localized, with {query.inliers} inliers"
+    return "right, but among the largest errors"

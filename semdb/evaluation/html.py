@@ -12,7 +12,7 @@ STYLE = """
 :root { --ink: #1b2430; --faint: #66727f; --line: #e3e7ec; --soft: #f5f7fa; --accent: #0072b2; }
 * { box-sizing: border-box; }
 body { font: 15px/1.55 system-ui, "Segoe UI", "DejaVu Sans", sans-serif; color: var(--ink); margin: 0 auto;
-  max-width: 1280px; padding: 2rem 1.5rem 5rem; }
+  max-width: 1360px; padding: 2rem 1.5rem 5rem; }
 h1 { font-size: 1.7rem; margin: 0 0 .2rem; } h2 { font-size: 1.3rem; margin: 3rem 0 .6rem; padding-top: .9rem;
   border-top: 2px solid var(--ink); }
 h3 { font-size: 1.05rem; margin: 1.9rem 0 .5rem; }
@@ -25,7 +25,7 @@ nav a { color: var(--accent); text-decoration: none; } nav a:hover { text-decora
   font-size: .88rem; display: block; line-height: 1.4; }
 div.wide { overflow-x: auto; margin: .4rem 0 1rem; }
 table { border-collapse: collapse; font-size: .88rem; font-variant-numeric: tabular-nums; }
-th, td { padding: .32rem .7rem; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line); }
+th, td { padding: .32rem .55rem; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line); }
 th { color: var(--faint); font-weight: 600; position: sticky; top: 0; background: white; }
 th.text, td.text { text-align: left; } td.prose { white-space: normal; text-align: left; min-width: 20rem; }
 tr:hover td { background: var(--soft); } tr.ours td { background: #eaf4fb; font-weight: 600; }

@@ -19,6 +19,7 @@ from semdb.ingest import IngestOptions, ingest_recording
 from semdb.localization.localizer import Localizer
 from semdb.localize import make_localizer
 from semdb.perception.describe import Describer, describer_from_specs
+from semdb.refine import refine_map
 from semdb.settings import Settings
 from semdb.types import Description, Detection, FloatArray, Frame, Localization, ModelInfo
 
@@ -226,6 +227,7 @@ def open_run(
 
 
 def _fill(map_name: str, task: Task, describer: Describer, store: Store, progress: Progress | None) -> None:
+    """Keyframes into the map, and what `semdb refine` computes of them."""
     for part in task.keyframes:
         options = IngestOptions(map_name=map_name)
         summary = ingest_recording(
@@ -234,3 +236,4 @@ def _fill(map_name: str, task: Task, describer: Describer, store: Store, progres
         for entry in part.entries:
             if entry.index in summary.failed:
                 part.recording.note_decode_failure(entry, FrameError(summary.failed[entry.index]))
+    refine_map(store, store.find_map(map_name), progress=progress)
