@@ -1,5 +1,6 @@
 # make demo   install the base into .venv and run the demonstration (no setting, no model file needed)
 # make test   install everything, MariaDB included, then lint, types and all tests
+# make test-train   train a small detector on rendered rooms from random weights; about 20 minutes
 # make lint   ruff and mypy            make lock    write requirements/constraints.txt anew
 # make bench  all benchmarks, on RECORDINGS="..." or a rendered room
 # make wheel  dist/*.whl               make clean   remove what make made
@@ -15,7 +16,7 @@ LOCK := requirements/constraints.txt
 # two processes: each starts a MariaDB of its own
 PYTEST_ARGS ?= --numprocesses 2
 
-.PHONY: help demo test unit lint services lock bench wheel clean
+.PHONY: help demo test test-train unit lint services lock bench wheel clean
 
 help:
 	@sed -n 's/^# \(make \)/\1/p' Makefile
@@ -30,8 +31,8 @@ $(VENV)/.stamp-base: pyproject.toml $(LOCK) | $(BIN)/python
 	@touch $@
 
 $(VENV)/.stamp-dev: pyproject.toml $(LOCK) | $(BIN)/python
-	@echo "installing semdb with the worker and development extras into $(VENV)"
-	@$(PIP) install --constraint $(LOCK) --editable '.[worker,dev]'
+	@echo "installing semdb with the torch (several GB), worker and development extras into $(VENV)"
+	@$(PIP) install --constraint $(LOCK) --editable '.[torch,worker,dev]'
 	@touch $(VENV)/.stamp-base $@
 
 demo: $(VENV)/.stamp-base
@@ -42,6 +43,9 @@ services:
 
 test: $(VENV)/.stamp-dev services lint
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+test-train: $(VENV)/.stamp-dev
+	$(BIN)/python -m pytest tests/acceptance/train_detector.py --timeout 3600 -s
 
 unit: $(VENV)/.stamp-dev
 	$(BIN)/python -m pytest tests/unit $(PYTEST_ARGS)

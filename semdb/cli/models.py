@@ -14,6 +14,7 @@ from semdb.errors import UsageError
 if TYPE_CHECKING:
     from semdb.cli.progress import Progress
     from semdb.settings import Settings
+    from semdb.types import ImageArray
 
 command = typer.Typer(
     help="The networks and features that describe images.",
@@ -99,6 +100,52 @@ def pull_models(
             + (" (recorded: its publisher gives none)" if done.recorded else ", as it should be")
             + f"; licence {model.licence}; use it as {model.spec}"
         )
+
+
+@command.command("export")
+def export_model(
+    spec: Annotated[str, typer.Argument(metavar="SPEC", help="torchvision:NAME or torchvision:PATH.")],
+    target: Annotated[Path, typer.Argument(metavar="FILE.onnx", help="The file to write.")],
+    check: Annotated[
+        list[Path] | None,
+        typer.Option("--check", metavar="PATH", help="Compare both on these images, or on frames of a recording."),
+    ] = None,
+    images: Annotated[int, typer.Option(min=1, help="Frames of each recording to compare on.")] = 5,
+) -> None:
+    """Write a torch network as an ONNX file for CPUs and robots, and compare the two.
+
+    Exit code 1 when they differ by more than rounding.
+    """
+    from semdb.cli.options import load_settings
+    from semdb.cli.progress import Progress, say
+    from semdb.perception.onnx_check import check_export
+    from semdb.perception.onnx_export import export
+
+    settings = load_settings()
+    done = export(spec, target, settings)
+    print(f"{done.role} {spec} is {done.path}, sha256 {done.sha256[:16]}…; use it as onnx:{done.path}")
+    if not check:
+        say("not compared with the original: --check IMAGE or --check RECORDING does that")
+        return
+    pictures = _pictures(check, images)
+    with Progress("comparing", unit="images") as progress:
+        print(check_export(done, spec, pictures, settings, progress.update))
+
+
+def _pictures(paths: list[Path], count: int) -> list[ImageArray]:
+    """The images among `paths`, and `count` frames evenly spread over each recording."""
+    from semdb.recordings import open_recordings, read_query_image
+
+    found = []
+    for path in paths:
+        if path.is_file():
+            found.append(read_query_image(path))
+            continue
+        for recording in open_recordings(path):
+            entries = recording.entries
+            step = max(1, len(entries) // count)
+            found += [recording.read(entry).image for entry in entries[::step][:count]]
+    return found
 
 
 def _show_megabytes(progress: Progress, done: int, total: int) -> None:

@@ -69,7 +69,7 @@ def evaluate_detector(detector: Detector, data: CocoData, progress: Progress | N
     found: list[dict[str, Any]] = []
     for done, picture in enumerate(data.pictures, start=1):
         for detection in detector.detect(read_picture(picture), None):
-            if detection.category in ids:
+            if detection.category in ids and not detection.weak:
                 found.append(_result(detection, picture, ids, rle))
         if progress is not None:
             progress(done, len(data.pictures))

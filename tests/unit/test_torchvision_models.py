@@ -202,7 +202,7 @@ def test_places365_features_are_those_before_the_last_layer(tmp_path: Path) -> N
 def test_places365_with_other_outputs_is_another_network(tmp_path: Path) -> None:
     (tmp_path / "models").mkdir()
     write_places365(tmp_path / "models" / "resnet50_places365.pth.tar", outputs=1000)
-    with pytest.raises(ModelError, match=r"resnet50_places365\.pth\.tar has 1000 outputs; resnet50-places365 has 365"):
+    with pytest.raises(ModelError, match=r"resnet50_places365\.pth\.tar has 1000 outputs, but should have 365"):
         load_encoder("torchvision:resnet50-places365", settings(cache_dir=tmp_path))
 
 

@@ -26,7 +26,6 @@ from semdb.settings import Settings
 from semdb.types import Float32Array, ImageArray, ModelInfo
 
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # RGB of ImageNet, which both networks were trained with
-_PLACES = ("resnet50-places365", "resnet50", 365)
 _LAYERS: dict[tuple[str, tuple[int, ...]], str] = {
     ("bottleneck", (3, 4, 6, 3)): "resnet50",
     ("bottleneck", (3, 4, 23, 3)): "resnet101",
@@ -43,7 +42,7 @@ class TorchvisionEncoder:
         self._torch = import_torch()
         path = resolve_checkpoint(spec, settings)
         name = spec.removeprefix("torchvision:")
-        network = load_encoder_checkpoint(path, _PLACES[2] if name == _PLACES[0] else None)
+        network = load_encoder_checkpoint(path, expected_outputs(spec))
         self._network = prepare(network, settings, self._torch)
         self._device = next(self._network.parameters()).device
         self._path = path
@@ -73,6 +72,11 @@ class TorchvisionEncoder:
         return np.stack([unit_vector(row, self._path) for row in found])
 
 
+def expected_outputs(spec: str) -> int | None:
+    """The number of classes that the file of a published ``torchvision:NAME`` must have; None for a path."""
+    return {"resnet50-places365": 365, "resnet50": 1000}.get(spec.removeprefix("torchvision:"))
+
+
 def load_encoder_checkpoint(path: Path, outputs: int | None = None) -> Any:
     """The network from ``[B, 3, 224, 224]`` RGB 0..1 to the average pool ``[B, d]`` of a ResNet checkpoint.
 
@@ -88,7 +92,7 @@ def load_encoder_checkpoint(path: Path, outputs: int | None = None) -> Any:
         raise ModelError(f"{path} is no checkpoint of torchvision's ResNet: it has no fc.weight, or other layers")
     classes = int(tensors["fc.weight"].shape[0])
     if outputs is not None and classes != outputs:
-        raise ModelError(f"{path} has {classes} outputs; {_PLACES[0]} has {outputs}: it is another network")
+        raise ModelError(f"{path} has {classes} outputs, but should have {outputs}: it is another network")
     return build_encoder(name, classes, tensors, path)
 
 
