@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from semdb.errors import ModelError, UsageError
+from semdb.perception.catalogue import BY_NAME
 from semdb.perception.model_files import models_dir, resolve_onnx
+from semdb.perception.torch_models import resolve_checkpoint
 from semdb.settings import Settings
 from semdb.types import ModelInfo
 
@@ -51,7 +53,7 @@ def specs_for_ingest(settings: Settings, map_models: Sequence[ModelInfo], *, has
     if not chosen["detector"]:
         raise UsageError(
             "this recording brings no object masks, so a detector is needed: set SEMDB_DETECTOR=onnx:FILE "
-            "(a Mask R-CNN as ONNX, see docs/models.md) or pass --detector"
+            "or torchvision:NAME (a Mask R-CNN, see docs/models.md) or pass --detector"
         )
     if chosen["detector"] == "recorded" and not has_masks:
         raise UsageError(
@@ -98,13 +100,18 @@ def settings_of_map(settings: Settings, map_models: Sequence[ModelInfo]) -> Sett
 
 
 def _spec_of(model: ModelInfo, settings: Settings) -> str:
-    """The spec that loads `model` here; files of ``onnx:`` models are looked for where bare names are."""
-    if not model.name.startswith("onnx:"):
+    """The spec that loads `model` here; files are looked for where bare names are."""
+    kind, _, name = model.name.partition(":")
+    if kind not in ("onnx", "torchvision"):
         return model.name
+    find = resolve_onnx if kind == "onnx" else resolve_checkpoint
     try:
-        return f"onnx:{resolve_onnx(model.name, settings)}"
+        path = find(model.name, settings)
     except ModelError as error:
+        fetch = f", fetch it with `semdb models pull {name}`" if kind == "torchvision" and name in BY_NAME else ""
         raise UsageError(
             f"the map was described by the {model.role} {model.name} (sha256 {model.sha256[:12]}), which is not at "
-            f"hand: set SEMDB_{model.role.upper()}=onnx:PATH to that file, or put it into {models_dir(settings)}"
+            f"hand: set SEMDB_{model.role.upper()}={kind}:PATH to that file{fetch}, or put it into "
+            f"{models_dir(settings)}"
         ) from error
+    return model.name if name in BY_NAME else f"{kind}:{path}"

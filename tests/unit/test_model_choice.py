@@ -68,3 +68,19 @@ def test_the_maps_thresholds_hold_unless_others_are_set(settings: Settings) -> N
     assert (taken.score_threshold, taken.max_keypoints) == (0.3, 700)
     own = Settings(score_threshold=0.7)
     assert settings_of_map(own, MAP).score_threshold == 0.7
+
+
+def test_a_query_finds_the_torch_models_of_its_map(tmp_path: Path) -> None:
+    (tmp_path / "models").mkdir()
+    settings = Settings(cache_dir=tmp_path, features="surf")
+    trained = ModelInfo("detector", "torchvision:kitchen.pth", "ab" * 32)
+    places = ModelInfo("encoder", "torchvision:resnet50-places365", "cd" * 32)
+    with pytest.raises(UsageError, match=r"detector torchvision:kitchen\.pth .*SEMDB_DETECTOR=torchvision:PATH"):
+        specs_for_query(settings, (trained, places))
+    (tmp_path / "models" / "kitchen.pth").touch()
+    with pytest.raises(UsageError, match=r"fetch it with `semdb models pull resnet50-places365`"):
+        specs_for_query(settings, (trained, places))
+    (tmp_path / "models" / "resnet50_places365.pth.tar").touch()
+    specs = specs_for_query(settings, (trained, places))
+    assert specs.detector == f"torchvision:{tmp_path}/models/kitchen.pth"
+    assert specs.encoder == "torchvision:resnet50-places365"
