@@ -72,7 +72,7 @@ def test_the_maps_thresholds_hold_unless_others_are_set(settings: Settings) -> N
 
 def test_a_query_finds_the_torch_models_of_its_map(tmp_path: Path) -> None:
     (tmp_path / "models").mkdir()
-    settings = Settings(cache_dir=tmp_path, features="surf")
+    settings = Settings(cache_dir=tmp_path, features="surf", detector="auto", encoder="auto")
     trained = ModelInfo("detector", "torchvision:kitchen.pth", "ab" * 32)
     places = ModelInfo("encoder", "torchvision:resnet50-places365", "cd" * 32)
     with pytest.raises(UsageError, match=r"detector torchvision:kitchen\.pth .*SEMDB_DETECTOR=torchvision:PATH"):
