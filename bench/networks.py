@@ -1,0 +1,155 @@
+"""torch and ONNX Runtime on the CPU, the same networks, in one run: time by image size, and by batch.
+
+``python -m bench.networks [RECORDING...] [--detector SPEC] [--encoder SPEC] [--repeats N] [--json FILE]``
+
+The specs are ``torchvision:`` ones; without them networks with random weights in the published architectures are
+timed (ResNet-50-FPN, its objects being what random weights see, and ResNet-50). Images are frames of the recordings,
+resized to each size. Prints the median of each and torch's time over ONNX Runtime's, which is what to compare.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from semdb.cli.options import load_settings
+from semdb.perception.detectors import load_detector
+from semdb.perception.encoders import load_encoder
+from semdb.perception.onnx_export import export
+from semdb.recordings import open_recordings
+from semdb.settings import Settings
+from semdb.types import ImageArray
+
+SIZES = ((320, 240), (640, 480), (1280, 960))
+BATCHES = (1, 2, 4, 8)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("recordings", nargs="*", type=Path)
+    parser.add_argument("--detector")
+    parser.add_argument("--encoder")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    settings = load_settings(device="cpu")
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        detector = arguments.detector or random_detector(folder / "detector.pth")
+        encoder = arguments.encoder or random_encoder(folder / "encoder.pth")
+        images = pictures(arguments.recordings)
+        results = {
+            "threads": settings.threads,
+            "detector": measure_detector(detector, folder, images, settings, arguments.repeats),
+            "encoder": measure_encoder(encoder, folder, images, settings, arguments.repeats),
+        }
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(results, indent=2) + "\n")
+
+
+def pictures(recordings: list[Path]) -> list[ImageArray]:
+    """Up to eight frames of the recordings; smooth noise without any."""
+    found = []
+    for recording in [r for path in recordings for r in open_recordings(path)]:
+        found += [recording.read(entry).image for entry in recording.entries[:: max(1, len(recording.entries) // 8)]]
+    rng = np.random.default_rng(0)
+    noise = [cv2.resize(rng.integers(0, 255, (30, 40, 3), dtype=np.uint8), (640, 480)) for _ in range(8)]
+    return found[:8] or [np.asarray(image, dtype=np.uint8) for image in noise]
+
+
+def measure_detector(
+    spec: str, folder: Path, images: list[ImageArray], settings: Settings, repeats: int
+) -> list[dict[str, Any]]:
+    file = export(spec, folder / "detector.onnx", settings).path
+    torch_one: Any = load_detector(spec, settings)
+    onnx_one = load_detector(f"onnx:{file}", settings)
+    rows = []
+    for width, height in SIZES:
+        image = cv2.resize(images[0], (width, height), interpolation=cv2.INTER_AREA)
+        row = compare(lambda im=image: torch_one.detect(im, None), lambda im=image: onnx_one.detect(im, None), repeats)
+        rows.append({"width": width, "height": height, "objects": len(onnx_one.detect(image, None)), **row})
+        show(f"detector {width}x{height}", rows[-1])
+    return rows
+
+
+def measure_encoder(
+    spec: str, folder: Path, images: list[ImageArray], settings: Settings, repeats: int
+) -> list[dict[str, Any]]:
+    file = export(spec, folder / "encoder.onnx", settings).path
+    torch_one: Any = load_encoder(spec, settings)
+    onnx_one = load_encoder(f"onnx:{file}", settings)
+    rows = []
+    for batch in BATCHES:
+        chosen = [images[k % len(images)] for k in range(batch)]
+        row = compare(
+            lambda some=chosen: torch_one.encode_batch(some),
+            lambda some=chosen: [onnx_one.encode(image) for image in some],
+            repeats,
+        )
+        rows.append(
+            {"batch": batch, **{name: value / (batch if name.endswith("ms") else 1) for name, value in row.items()}}
+        )
+        show(f"encoder, {batch} at once, per image", rows[-1])
+    return rows
+
+
+def compare(torch_work: Callable[[], object], onnx_work: Callable[[], object], repeats: int) -> dict[str, float]:
+    """Median milliseconds of both, in turns, after one run of each that does not count."""
+    times: dict[str, list[float]] = {"torch": [], "onnx": []}
+    for repeat in range(repeats + 1):
+        for name, work in (("torch", torch_work), ("onnx", onnx_work)):
+            start = time.perf_counter()
+            work()
+            if repeat:
+                times[name].append((time.perf_counter() - start) * 1000)
+    medians = {name: statistics.median(values) for name, values in times.items()}
+    return {
+        "torch_ms": medians["torch"],
+        "onnx_ms": medians["onnx"],
+        "torch_over_onnx": medians["torch"] / medians["onnx"],
+    }
+
+
+def show(what: str, row: dict[str, Any]) -> None:
+    print(
+        f"{what}: torch {row['torch_ms']:.0f} ms, ONNX Runtime {row['onnx_ms']:.0f} ms, "
+        f"torch / ONNX Runtime {row['torch_over_onnx']:.2f}"
+    )
+    sys.stdout.flush()
+
+
+def random_detector(path: Path) -> str:
+    import torch
+
+    from semdb.perception.mask_rcnn import Architecture, build
+
+    torch.manual_seed(0)
+    network = build(Architecture("resnet50"), 91)
+    with torch.no_grad():  # about as many objects as a trained network finds in a kitchen
+        network.roi_heads.box_predictor.cls_score.bias[62] += 6.0
+        network.roi_heads.box_predictor.bbox_pred.weight.mul_(0.1)
+    torch.save(network.state_dict(), path)
+    return f"torchvision:{path}"
+
+
+def random_encoder(path: Path) -> str:
+    import torch
+    import torchvision
+
+    torch.manual_seed(0)
+    torch.save(torchvision.models.resnet50(weights=None).state_dict(), path)
+    return f"torchvision:{path}"
+
+
+if __name__ == "__main__":
+    main()
