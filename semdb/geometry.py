@@ -68,17 +68,24 @@ def quat_wxyz_from_rotation(rotation: FloatArray) -> FloatArray:
 def rotation_from_quat_wxyz(quat_wxyz: npt.ArrayLike) -> FloatArray:
     """Rotation ``[3, 3]`` of a quaternion ``[4]`` (w, x, y, z) of any length but zero. Raises ValueError."""
     q = np.asarray(quat_wxyz, dtype=np.float64)
-    norm = float(np.linalg.norm(q))
-    if q.shape != (4,) or not np.isfinite(norm) or norm < 1e-12:
+    if q.shape != (4,):
         raise ValueError("not a quaternion: four finite numbers, not all zero, are needed")
-    w, x, y, z = q / norm
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    rotation: FloatArray = rotations_from_quats_wxyz(q[np.newaxis])[0]
+    return rotation
+
+
+def rotations_from_quats_wxyz(quats_wxyz: FloatArray) -> FloatArray:
+    """Rotations ``[n, 3, 3]`` of quaternions ``[n, 4]`` (w, x, y, z) of any length but zero. Raises ValueError."""
+    norm = np.sqrt((quats_wxyz * quats_wxyz).sum(axis=1, keepdims=True))
+    if not np.isfinite(norm).all() or (norm < 1e-12).any():
+        raise ValueError("not a quaternion: four finite numbers, not all zero, are needed")
+    w, x, y, z = (quats_wxyz / norm).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.ascontiguousarray(np.moveaxis(np.array(rows), 2, 0))
 
 
 def slerp_wxyz(first: FloatArray, second: FloatArray, fraction: float) -> FloatArray:

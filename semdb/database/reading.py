@@ -25,7 +25,7 @@ from semdb.database.tables import (
     recordings,
 )
 from semdb.errors import CodecError, NotFoundError
-from semdb.geometry import pose_from, rotation_from_quat_wxyz
+from semdb.geometry import pose_from, rotation_from_quat_wxyz, rotations_from_quats_wxyz
 from semdb.types import BoolArray, Camera, Float32Array, FloatArray, ObjectGeometry
 
 CHUNK = 500
@@ -89,8 +89,12 @@ def poses(engine: Engine, map_id: int, keys: Sequence[int] | None = None) -> tup
         return list(_chunked(connection, _ints(keys), lambda chunk: query.where(k.id.in_(chunk))))
 
     rows = sorted(map(tuple, retry.read(engine, work)))
-    matrices = np.array([pose_from(rotation_from_quat_wxyz(row[1:5]), row[5:8]) for row in rows], dtype=np.float64)
-    return [row[0] for row in rows], matrices.reshape(-1, 4, 4)
+    numbers = np.array([row[1:] for row in rows], dtype=np.float64).reshape(-1, 7)
+    matrices = np.zeros((len(rows), 4, 4))
+    matrices[:, :3, :3] = rotations_from_quats_wxyz(numbers[:, :4])
+    matrices[:, :3, 3] = numbers[:, 4:]
+    matrices[:, 3, 3] = 1.0
+    return [row[0] for row in rows], matrices
 
 
 def load_keyframes(engine: Engine, keys: Sequence[int], *, with_descriptors: bool = True) -> list[StoredKeyframe]:

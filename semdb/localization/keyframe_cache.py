@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
 from semdb.database.records import StoredKeyframe
 from semdb.database.store import Store
 from semdb.errors import NotFoundError
+from semdb.geometry import POSE_UNIT_M, pose_distances
 from semdb.localization.coarse import MapChange
 from semdb.localization.views import ClassNumbers, KeyframeView, make_keyframe_view
 from semdb.types import FloatArray
@@ -77,6 +79,24 @@ class KeyframeCache:
     def name_of(self, keyframe_id: int) -> tuple[str, int]:
         """Recording and frame index of a keyframe that was loaded."""
         return self._names.get(keyframe_id, ("", -1))
+
+    def near(self, pose: FloatArray, limit: float, without: Collection[int]) -> list[int]:
+        """Ids of the keyframes less than `limit` from `pose` (`pose_distances`), nearest first, but for `without`."""
+        ids, poses = self.poses()
+        # the distance is at least that of the positions alone: turns are worked out for few
+        close = np.flatnonzero(((poses[:, :3, 3] - pose[:3, 3]) ** 2).sum(axis=1) < (limit * POSE_UNIT_M) ** 2)
+        distance = pose_distances(pose, poses[close])
+        order = [int(n) for n in np.argsort(distance, kind="stable") if distance[n] < limit]
+        return [found for found in (ids[close[n]] for n in order) if found not in without]
+
+    def distances(self, pose: FloatArray, keyframe_ids: Sequence[int]) -> FloatArray:
+        """How far keyframes are from `pose` (`pose_distances`); zero for one that is not there any more."""
+        ids, poses = self.poses()
+        at = [bisect_left(ids, keyframe_id) for keyframe_id in keyframe_ids]
+        known = [n < len(ids) and ids[n] == keyframe_id for n, keyframe_id in zip(at, keyframe_ids, strict=True)]
+        found = np.zeros(len(at))
+        found[known] = pose_distances(pose, poses[[n for n, there in zip(at, known, strict=True) if there]])
+        return found
 
     def poses(self) -> tuple[list[int], FloatArray]:
         """Ids, ascending, and ``world_from_camera`` ``[n, 4, 4]`` of all keyframes of the map."""

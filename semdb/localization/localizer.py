@@ -11,7 +11,6 @@ import numpy as np
 from semdb.class_score import ClassQuery, strengths
 from semdb.database.planning import check_models
 from semdb.errors import NotFoundError
-from semdb.geometry import pose_distances
 from semdb.localization.coarse import (
     Batch,
     CoarseOptions,
@@ -174,11 +173,7 @@ class Localizer:
         if search.estimate is None or self.options.neighbours == 0:
             return
         matched = {keyframe.keyframe_id for keyframe in search.keyframes}
-        ids, poses = self.cache.poses()
-        distance = pose_distances(search.estimate.world_from_camera, poses)
-        distance[[n for n, keyframe_id in enumerate(ids) if keyframe_id in matched]] = np.inf
-        nearest = [int(n) for n in np.argsort(distance, kind="stable")[: self.options.neighbours]]
-        chosen = [ids[n] for n in nearest if distance[n] < FAR]
+        chosen = self.cache.near(search.estimate.world_from_camera, FAR, matched)[: self.options.neighbours]
         if not chosen:
             return
         before = search.estimate
@@ -198,16 +193,10 @@ class Localizer:
         if search.estimate is None or not known:
             return
         limit = max(known) - self.options.twin_cosine
-        ids, poses = self.cache.poses()
-        distance = dict(zip(ids, pose_distances(search.estimate.world_from_camera, poses), strict=True))
         matched = {keyframe.keyframe_id for keyframe in search.keyframes}
-        chosen = [
-            proposal
-            for proposal in search.following
-            if proposal.cosine >= limit
-            and proposal.keyframe_id not in matched
-            and distance.get(proposal.keyframe_id, 0.0) >= FAR
-        ][: self.options.twins]
+        alike = [p for p in search.following if p.cosine >= limit and p.keyframe_id not in matched]
+        distance = self.cache.distances(search.estimate.world_from_camera, [p.keyframe_id for p in alike])
+        chosen = [p for p, far in zip(alike, distance >= FAR, strict=True) if far][: self.options.twins]
         if chosen:
             search.proposals += chosen
             self._match(search, [proposal.keyframe_id for proposal in chosen])
