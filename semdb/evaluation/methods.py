@@ -45,7 +45,13 @@ class Method:
 
 # The filter as the paper has it: keyframes that share half of the query's objects, by counts, and no others.
 _PAPER_FILTER = CoarseOptions(
-    scoring=Scoring.COUNTS, minimum_share=0.5, filtered_share=1.0, cascade=False, filtered_batches=(1,)
+    scoring=Scoring.COUNTS,
+    minimum_share=0.5,
+    filtered_share=1.0,
+    filtered_at_most=1_000_000_000,
+    class_weight=0.0,
+    cascade=False,
+    filtered_batches=(1,),
 )
 # The same with the whole budget of the default cascade, 10 keyframes, spent on what passes.
 _HARD = replace(_PAPER_FILTER, filtered_batches=(1, 2, 3, 4))

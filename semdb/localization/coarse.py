@@ -1,8 +1,8 @@
 """The coarse step: which keyframes are worth matching, and in which order.
 
 A cascade. First the keyframes that show most of what the query shows (the class-attribute filter: the best so many by
-class score), ranked by the cosine of the CNN vectors; where verification does not convince, all keyframes by cosine
-plus a term for the class score; then all by cosine alone. Most queries are answered by the first stage, and a missed
+class score), ranked by the cosine of the CNN vectors plus a term for the class score; where verification does not
+convince, all keyframes by the same sum; then all by cosine alone. Most queries are answered by the first stage, and a missed
 detection costs time instead of the answer.
 """
 
@@ -52,7 +52,7 @@ class CoarseOptions:
     filtered_share: float = 0.15
     filtered_at_least: int = 8
     filtered_at_most: int = 1000
-    class_weight: float = 0.1  # of the class score beside the cosine in the soft stage
+    class_weight: float = 0.2  # of the class score beside the cosine, but in the last stage
     filtered_batches: tuple[int, ...] = (1, 2)
     soft_batches: tuple[int, ...] = (3,)
     all_batches: tuple[int, ...] = (4,)
@@ -232,7 +232,7 @@ def _rank_filtered(
 ) -> Ranked:
     passed = source.filtered(query, options.minimum_share, options.passing(source.keyframe_count()))
     cosines = source.cosines(query_vector, passed.keyframe_ids)
-    order = best_first(passed.keyframe_ids, cosines)
+    order = best_first(passed.keyframe_ids, cosines + options.class_weight * passed.class_scores)
     return Ranked(passed.keyframe_ids[order], passed.class_scores[order], cosines[order])
 
 
