@@ -191,18 +191,17 @@ def _key(recording: Recording, entry: FrameEntry) -> Key:
 
 
 def _with_poses(parts: Sequence[Part], poses: Mapping[Key, FloatArray]) -> tuple[Part, ...]:
-    """The parts with these poses, without the frames that have none."""
-    return tuple(
-        Part(
-            part.recording,
-            tuple(
-                replace(entry, world_from_camera=poses[_key(part.recording, entry)])
-                for entry in part.entries
-                if _key(part.recording, entry) in poses
-            ),
-        )
-        for part in parts
-    )
+    """The parts with these poses, in their recordings too, without the frames that have none."""
+    found = []
+    for part in parts:
+        own = {
+            entry.index: replace(entry, world_from_camera=poses[_key(part.recording, entry)])
+            for entry in part.entries
+            if _key(part.recording, entry) in poses
+        }
+        entries = tuple(own.get(entry.index, entry) for entry in part.recording.entries)
+        found.append(Part(replace(part.recording, entries=entries), tuple(own.values())))
+    return tuple(found)
 
 
 def _selecting(name: str, progress: Progress | None) -> Callable[[int, int], None]:

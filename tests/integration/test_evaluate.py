@@ -173,6 +173,9 @@ def test_colmap_and_both_truths(room: Path, tmp_path: Path) -> None:
     for result in results[:2]:
         other = result["other_errors"]
         assert abs(other["median_translation_m"] - result["median_translation_m"]) < 0.02
+    # the second run has another map: its answers are nearer to the poses that this map has
+    assert results[2]["per_query"][0]["translation_m"] != results[0]["per_query"][0]["translation_m"]
+    assert results[2]["per_query"][0]["other_translation_m"] != results[0]["per_query"][0]["translation_m"]
     colmap = results[1]
     assert colmap["localized"] >= 3
     assert colmap["median_translation_m"] < 0.02
