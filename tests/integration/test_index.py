@@ -154,6 +154,29 @@ def test_only_what_changed_is_read(store: Store, options: IndexOptions, monkeypa
     assert_same(source, sql, 1)
 
 
+def test_a_map_that_grows_large_is_reduced_beside_the_queries(store: Store, tmp_path: Path) -> None:
+    map_id, _, _ = fill(store, "lab", "first", range(0, 12, 2))
+    said: list[str] = []
+    with MapIndex.open(store, map_id, tmp_path, options=REDUCED, say=said.append) as index:
+        source, sql = IndexSource(index), SqlSource(store, map_id)
+        assert index.state.reduction is None
+        fill(store, "lab", "second", range(0, 10, 2))
+        for changed in (source, sql):
+            changed.refresh()
+        assert_same(source, sql, 1)  # before, while or after components are found: the answers are the same
+        index.settle()
+        assert index.state.reduction is not None
+        assert index.state.reduction.fitted_on == 11
+        fill(store, "lab", "third", range(0, 4, 2))
+        for changed in (source, sql):
+            changed.refresh()
+        assert_same(source, sql, 2)
+    with MapIndex.open(store, map_id, tmp_path, options=REDUCED, say=said.append) as again:
+        assert again.state.reduction is not None  # from the file
+        assert again.state.living == 13
+    assert said == []
+
+
 def test_sources_are_told_what_changed_since_they_looked(store: Store) -> None:
     map_id, _, ids = fill(store, frame_indexes=range(4))
     index = MapIndex.open(store, map_id)

@@ -15,7 +15,7 @@ from semdb.localization.coarse import MapChange
 from semdb.localization.index.cache_files import CacheError
 from semdb.localization.index.cache_folder import CacheFolder
 from semdb.localization.index.loading import load_mirror, same_as_database
-from semdb.localization.index.mirror import IndexOptions, Mirror
+from semdb.localization.index.mirror import IndexOptions, Mirror, reduced
 from semdb.localization.index.state import State
 
 Progress = Callable[[int, int], None]
@@ -44,6 +44,7 @@ class MapIndex:
         self._reader = ChangeReader(store, map_id)
         self._mirror = Mirror(options)
         self._unsaved = 0
+        self._reducer: threading.Thread | None = None
         self._history: deque[tuple[int, MapChange]] = deque(maxlen=REMEMBERED)
         self._current: tuple[int, State] = (0, self._mirror.state())
 
@@ -73,6 +74,7 @@ class MapIndex:
 
     def close(self) -> None:
         """Writes what is not on disk yet, for the next start."""
+        self.settle()
         with self._lock:
             if self._unsaved:
                 self._save()
@@ -213,11 +215,37 @@ class MapIndex:
     def _tidy(self) -> None:
         """Writes to disk what has become much, and lets a map that has grown large be reduced."""
         mirror = self._mirror
-        if mirror.reduce():
-            self._unsaved += len(mirror)
-            self._current = (self._current[0], mirror.state())
         many = mirror.tail is not None and len(mirror.tail) >= FLUSH_ROWS
         if many or self._unsaved > max(FLUSH_ROWS // 8, SAVE_SHARE * len(mirror)):
+            self._save()
+        if mirror.wants_reduction() and not self._reducing():
+            self._reducer = threading.Thread(target=self._reduce, args=(mirror,), name="index-reduce", daemon=True)
+            self._reducer.start()
+
+    def settle(self) -> None:
+        """Waits until reduced vectors that are being worked out are in use."""
+        while self._reducing() and self._reducer is not None:
+            self._reducer.join()
+
+    def _reducing(self) -> bool:
+        return self._reducer is not None and self._reducer.is_alive()
+
+    def _reduce(self, mirror: Mirror) -> None:
+        """Works out reduced vectors beside the queries and refreshes, which go on without them until they are there."""
+        with self._lock:
+            vectors, renumbered = mirror.state().vectors, mirror.renumbered
+        try:
+            found = reduced(vectors, self.options.components)
+        except OSError as error:
+            if self.say is not None:
+                self.say(f"the index of map {self.map_id} stays without reduced vectors for now: {error}")
+            return
+        with self._lock:
+            if mirror is not self._mirror or mirror.renumbered != renumbered:
+                return  # its rows are others now: the next refresh that changes anything starts again
+            mirror.set_reduction(*found)
+            self._unsaved += len(mirror)
+            self._current = (self._current[0], mirror.state())
             self._save()
 
     def _save(self) -> None:

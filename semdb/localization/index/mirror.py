@@ -47,6 +47,7 @@ class Mirror:
         self._held: IntArray = np.zeros(SPARE_ROWS, np.int32)
         self._frequencies: Int64Array = np.zeros(SPARE_CLASSES, np.int64)
         self._codes: CodeArray | None = None
+        self.renumbered = 0  # how often rows got other numbers
 
     def __len__(self) -> int:
         return self._count
@@ -84,6 +85,7 @@ class Mirror:
         self, ids: Int64Array, alive: BoolArray, names: Sequence[str], counts: ByteArray, parts: Iterable[Part]
     ) -> None:
         """Takes over whole arrays; `counts` ``[classes, n]`` has its classes in the order of `names`."""
+        self.renumbered += 1
         self._count = len(ids)
         self._ids, self._alive = ids, alive
         self.categories = {name: row for row, name in enumerate(names)}
@@ -154,24 +156,23 @@ class Mirror:
             self._alive[rows] = False
             self._frequencies = self._frequencies - np.count_nonzero(self._counts[:, rows], axis=1)
 
-    def reduce(self) -> bool:
-        """Finds components and codes where the map has become large enough for them, or much larger; whether so."""
-        options, fitted = self.options, self.reduction.fitted_on if self.reduction is not None else 0
-        if self._count <= options.exact_up_to or (fitted and self._count < 2 * fitted):
-            return False
-        vectors = self._vectors()
-        self.bound_memory()
-        sample = vectors.take(sample_rows(self._count))
-        self.reduction = fit_reduction(sample, options.components, self._count)
-        codes = np.empty((len(self._ids), len(self.reduction.axes)), np.int8)
-        for start, piece in vectors.chunks():
-            codes[start : start + len(piece)] = self.reduction.encode(piece)
-        self._codes = codes
-        return True
+    def wants_reduction(self) -> bool:
+        """Whether the map has become large enough for reduced vectors, or much larger than when they were found."""
+        fitted = self.reduction.fitted_on if self.reduction is not None else 0
+        return self._count > self.options.exact_up_to and (not fitted or self._count >= 2 * fitted)
+
+    def reduce(self) -> None:
+        """Finds components and codes where `wants_reduction` says so."""
+        if self.wants_reduction():
+            self.bound_memory()
+            self.set_reduction(*reduced(self._vectors(), self.options.components))
 
     def set_reduction(self, reduction: Reduction, codes: CodeArray) -> None:
-        """Takes over components and the codes of all rows."""
-        self.reduction, self._codes = reduction, codes
+        """Takes over components and the codes of the first rows ``[n, components]``; works out those of the rest."""
+        self.reduction = reduction
+        first, self._codes = len(codes), _grown(codes, len(codes), len(self._ids))
+        for start, piece in self._vectors().chunks(first=first):
+            self._codes[start : start + len(piece)] = reduction.encode(piece)
         self.bound_memory()
 
     def bound_memory(self) -> None:
@@ -187,6 +188,7 @@ class Mirror:
 
     def keep_living(self, parts: Iterable[Part]) -> None:
         """Forgets dead rows; `parts` have the vectors of the others. States that readers hold stay as they are."""
+        self.renumbered += 1
         rows = np.flatnonzero(self._alive)
         self._ids = self._ids[rows]
         self._counts = self._counts[:, rows]
@@ -223,6 +225,15 @@ class Mirror:
             pairs += int(np.count_nonzero(living))
             total += int(living.sum(dtype=np.int64))
         return pairs, total
+
+
+def reduced(vectors: Vectors, components: int) -> tuple[Reduction, CodeArray]:
+    """Components of `vectors`, and the codes of all of them int8 ``[n, components]``."""
+    reduction = fit_reduction(vectors.take(sample_rows(len(vectors))), components, len(vectors))
+    codes = np.empty((len(vectors), len(reduction.axes)), np.int8)
+    for start, piece in vectors.chunks():
+        codes[start : start + len(piece)] = reduction.encode(piece)
+    return reduction, codes
 
 
 def _grown(array: npt.NDArray[Number], count: int, room: int) -> npt.NDArray[Number]:
