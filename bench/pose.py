@@ -40,7 +40,7 @@ from semdb.perception.features.surf_features import SurfFeatures
 from semdb.perception.lifting import lift
 from semdb.recordings import open_recordings
 from semdb.recordings.base import Recording
-from semdb.types import FloatArray, Frame, IntArray, Keypoints
+from semdb.types import FloatArray, Frame, ImageArray, IntArray, Keypoints
 
 OPTIONS = PoseOptions()
 Found = tuple[FloatArray | None, dict[str, float]]  # world_from_camera, milliseconds of "match" and "pose"
@@ -70,14 +70,15 @@ def measure(recording: Recording, keyframes: int, queries: int, candidates: int)
     for entry in chosen:
         frame = recording.read(entry)
         assert frame.world_from_camera is not None
-        points = describe(frame, features, with_depth=True)
-        views.append(make_keyframe_view(entry.index, frame.camera, frame.world_from_camera, points, (), numbers))
+        points, pose = describe(frame, features, with_depth=True), frame.world_from_camera
+        views.append(make_keyframe_view(entry.index, frame.camera, pose, points, (), numbers, grey_of(frame)))
     poses = np.stack([view.world_from_camera for view in views])
     rows: dict[str, list[tuple[float, float, float, float]]] = {name: [] for name in METHODS}
     for count, entry in enumerate(split_paper(recording.entries, chosen, queries)):
         frame = recording.read(entry)
         assert frame.world_from_camera is not None
-        query = make_view(frame.camera, describe(frame, features, with_depth=False), (), numbers)
+        found = describe(frame, features, with_depth=False)
+        query = make_view(frame.camera, found, (), numbers, grey=grey_of(frame))
         near = [views[i] for i in nearest_in_pose(frame.world_from_camera, poses, candidates)]
         for name, method in METHODS.items():
             if count == 0:
@@ -95,9 +96,13 @@ def measure(recording: Recording, keyframes: int, queries: int, candidates: int)
 
 
 def describe(frame: Frame, features: SurfFeatures, *, with_depth: bool) -> Keypoints:
-    found = features.extract(cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY))
+    found = features.extract(grey_of(frame))
     depth = frame.depth if with_depth else None
     return Keypoints(found, np.full(len(found), -1, np.int32), lift(frame.camera, depth, found.xy))
+
+
+def grey_of(frame: Frame) -> ImageArray:
+    return np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def by_semdb(query: View, keyframes: Sequence[KeyframeView]) -> Found:

@@ -6,6 +6,7 @@ from bisect import bisect_left
 from collections import OrderedDict
 from collections.abc import Collection, Sequence
 
+import cv2
 import numpy as np
 
 from semdb.database.records import StoredKeyframe
@@ -14,11 +15,11 @@ from semdb.errors import NotFoundError
 from semdb.geometry import POSE_UNIT_M, pose_distances
 from semdb.localization.coarse import MapChange
 from semdb.localization.views import ClassNumbers, KeyframeView, make_keyframe_view
-from semdb.types import FloatArray
+from semdb.types import FloatArray, ImageArray
 
 
 class KeyframeCache:
-    """Loads keyframes from the database and keeps the `capacity` last used (about 1 MiB each)."""
+    """Loads keyframes from the database and keeps the `capacity` last used (about 1.3 MiB each)."""
 
     def __init__(self, store: Store, map_id: int, capacity: int = 64) -> None:
         self.numbers = ClassNumbers()
@@ -66,6 +67,7 @@ class KeyframeCache:
                 stored.keypoints,
                 [found.category for found in stored.objects],
                 self.numbers,
+                self._grey(stored),
             )
 
     def _stored(self, keyframe_ids: Sequence[int]) -> list[StoredKeyframe]:
@@ -75,6 +77,17 @@ class KeyframeCache:
             if len(keyframe_ids) == 1:
                 return []  # deleted since the coarse step proposed it
             return [found for keyframe_id in keyframe_ids for found in self._stored([keyframe_id])]
+
+    def _grey(self, stored: StoredKeyframe) -> ImageArray | None:
+        """The keyframe's image in grey; None where it cannot be decoded or is not what the camera took."""
+        try:
+            encoded = np.frombuffer(self._store.load_image(stored.id).rgb, np.uint8)
+        except NotFoundError:
+            return None  # deleted a moment ago
+        grey = cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE) if len(encoded) else None
+        if grey is None or grey.shape != (stored.camera.height, stored.camera.width) or grey.dtype != np.uint8:
+            return None
+        return np.asarray(grey, np.uint8)
 
     def name_of(self, keyframe_id: int) -> tuple[str, int]:
         """Recording and frame index of a keyframe that was loaded."""

@@ -134,7 +134,9 @@ class Localizer:
 
     def _view_of(self, description: Description) -> View:
         categories = [detection.category for detection in description.detections]
-        return make_view(description.camera, description.keypoints, categories, self.cache.numbers)
+        return make_view(
+            description.camera, description.keypoints, categories, self.cache.numbers, grey=description.grey
+        )
 
     def _try(self, search: _Search, batch: Batch) -> None:
         search.stage, search.ranked = batch.stage, batch.ranked

@@ -9,12 +9,13 @@ import numpy as np
 import poselib
 
 from semdb.geometry import invert_pose, pose_error, transform_points
-from semdb.localization.bundle import BundleProblem, BundleResult, MotionPrior, adjust, pixel_sigma
+from semdb.localization.adjustment import NEAREST_M, adjusted_error_px, bundle_adjust, in_front, project_adjusted
+from semdb.localization.alignment import Alignment, align_pairs
+from semdb.localization.bundle import BundleResult, MotionPrior
 from semdb.localization.matching import Matches, MatchingOptions, match_guided, match_keypoints
 from semdb.localization.views import KeyframeView, View
 from semdb.types import BoolArray, FloatArray, IntArray
 
-NEAREST_M = 0.05  # what is nearer is not in front of the camera
 MINIMUM_PAIRS = 6  # below, a pose from 3 points has nothing to be checked with
 
 
@@ -26,7 +27,8 @@ class PoseOptions:
     max_reprojection_px: float = 5.0
     inlier_px: float = 4.0
     close_radius_px: float = 6.0  # of guided matching once images' turns are known
-    pixel_sigma_px: float = 1.0
+    pixel_sigma_px: float = 1.0  # of the finest keypoints
+    aligned_sigma_px: float = 0.35  # of one whose patch was aligned
     guided: bool = True
     bundle: bool = True
     use_query_depth: bool = True
@@ -163,29 +165,6 @@ def guided_pairs(
     )
 
 
-def _in_front(points: FloatArray) -> FloatArray:
-    """Normalised coordinates ``[n, 2]`` of camera-frame points, NaN where they are not in front of the camera."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(points[:, 2:] > NEAREST_M, points[:, :2] / points[:, 2:], np.nan)
-
-
-def project_adjusted(query: View, keyframes: Sequence[KeyframeView], adjusted: BundleResult) -> list[FloatArray]:
-    """Where the query sees each keyframe's points, ``[n, 2]`` pixels from the centre, NaN behind it.
-
-    All images stand and turn as `adjusted` found; the points are those measured in the keyframes.
-    """
-    projected = []
-    for slot, keyframe in enumerate(keyframes, start=1):
-        local = keyframe.view.points.astype(np.float64)
-        local -= np.cross(adjusted.turn[slot] * keyframe.view.image_row[:, None], local)
-        world = transform_points(invert_pose(adjusted.image_from_world[slot]), local)
-        seen = transform_points(adjusted.camera_from_world, world)
-        # the row that sees a point, to first order where it would be without a turn
-        row = np.clip(_in_front(seen)[:, 1:] * query.focal / query.camera.height, -0.5, 0.5)
-        projected.append(_in_front(seen + np.cross(adjusted.turn[0] * row, seen)) * query.focal)
-    return projected
-
-
 def estimate_pose(
     query: View, keyframes: Sequence[KeyframeView], matches: Sequence[Matches], options: PoseOptions
 ) -> PoseEstimate | None:
@@ -228,26 +207,30 @@ def _refine(
 ) -> tuple[Pairs, FloatArray, BundleResult]:
     """Bundle adjustment; with guided matching once roughly, then again over what matches near its projections.
 
-    Returns the pairs with their errors in pixels. Raises numpy.linalg.LinAlgError where the pose is not determined.
+    For that the patches of the keyframes are aligned in the query. Returns the pairs with their errors in pixels.
+    Raises numpy.linalg.LinAlgError where the pose is not determined.
     """
-    adjusted = bundle_adjust(
-        query, keyframes, pairs.take(agreeing), points[agreeing], camera_from_world, options, rough=options.guided
-    )
-    if options.guided:
-        matching = replace(options.matching, guided_radius_px=options.close_radius_px)
-        pairs = guided_pairs(query, keyframes, project_adjusted(query, keyframes, adjusted), matching)
-        agreeing = adjusted_error_px(query, keyframes, pairs, adjusted) < options.inlier_px
-        if agreeing.sum() < MINIMUM_PAIRS:
-            raise np.linalg.LinAlgError("too few pairs are left")
-        points = world_points_of(pairs, keyframes)[agreeing]
-        adjusted = bundle_adjust(query, keyframes, pairs.take(agreeing), points, adjusted.camera_from_world, options)
+    used = pairs.take(agreeing)
+    if not options.guided:
+        unaligned = Alignment(query.xy[used.query], np.zeros(len(used), np.bool_))
+        adjusted = bundle_adjust(query, keyframes, used, points[agreeing], camera_from_world, options, unaligned)
+        return pairs, adjusted_error_px(query, keyframes, pairs, adjusted), adjusted
+    adjusted = bundle_adjust(query, keyframes, used, points[agreeing], camera_from_world, options)
+    matching = replace(options.matching, guided_radius_px=options.close_radius_px)
+    pairs = guided_pairs(query, keyframes, project_adjusted(query, keyframes, adjusted), matching)
+    agreeing = adjusted_error_px(query, keyframes, pairs, adjusted) < options.inlier_px
+    if agreeing.sum() < MINIMUM_PAIRS:
+        raise np.linalg.LinAlgError("too few pairs are left")
+    used, points = pairs.take(agreeing), world_points_of(pairs, keyframes)[agreeing]
+    alignment = align_pairs(query, keyframes, used.query, used.slot, used.keypoint, adjusted)
+    adjusted = bundle_adjust(query, keyframes, used, points, adjusted.camera_from_world, options, alignment)
     return pairs, adjusted_error_px(query, keyframes, pairs, adjusted), adjusted
 
 
 def _project(query: View, keyframes: Sequence[KeyframeView], camera_from_world: FloatArray) -> list[FloatArray]:
     """Where the query sees each keyframe's points under a pose alone, ``[n, 2]`` pixels from the centre."""
     return [
-        _in_front(transform_points(camera_from_world, keyframe.world_points)) * query.focal for keyframe in keyframes
+        in_front(transform_points(camera_from_world, keyframe.world_points)) * query.focal for keyframe in keyframes
     ]
 
 
@@ -327,62 +310,3 @@ def image_spread(query: View, rows: IntArray) -> float:
     size = np.array([query.camera.width, query.camera.height])
     cells = np.clip((query.seen_xy[rows] * 4 / size).astype(int), 0, 3)
     return len(np.unique(cells[:, 0] * 4 + cells[:, 1])) / 16
-
-
-def bundle_adjust(
-    query: View,
-    keyframes: Sequence[KeyframeView],
-    pairs: Pairs,
-    points: FloatArray,
-    camera_from_world: FloatArray,
-    options: PoseOptions,
-    *,
-    rough: bool = False,
-) -> BundleResult:
-    """Equation (5) over the agreeing pairs. Pairs of one query keypoint with several keyframes are one point."""
-    rows, point_index = np.unique(pairs.query, return_inverse=True)
-    counts = np.bincount(point_index).astype(np.float64)
-    first_guess = np.stack([np.bincount(point_index, points[:, axis]) / counts for axis in range(3)], axis=1)
-    seen = [_observations(query, rows, options, with_depth=options.use_query_depth)]
-    owner, image = [np.arange(len(rows))], [np.zeros(len(rows), np.int32)]
-    for slot, keyframe in enumerate(keyframes):
-        here = np.flatnonzero(pairs.slot == slot)
-        seen.append(_observations(keyframe.view, pairs.keypoint[here], options, with_depth=True))
-        owner.append(point_index[here])
-        image.append(np.full(len(here), slot + 1, np.int32))
-    observed, point = np.concatenate(seen), np.concatenate(owner).astype(np.int32)
-    order = np.argsort(point, kind="stable")
-    observed = observed[order]
-    problem = BundleProblem(
-        points=first_guess,
-        observed_point=point[order],
-        observed_image=np.concatenate(image)[order],
-        xy=observed[:, :2],
-        sigma=observed[:, 2],
-        depth=observed[:, 3],
-        rows=observed[:, 4],
-        keyframe_from_world=np.stack([keyframe.camera_from_world for keyframe in keyframes]),
-    )
-    return adjust(problem, camera_from_world, options.motion, rough=rough)
-
-
-def _observations(view: View, rows: IntArray, options: PoseOptions, *, with_depth: bool) -> FloatArray:
-    """(x, y, sigma, depth, row of the image) ``[n, 5]`` of keypoints `rows`."""
-    sigma = pixel_sigma(view.size[rows], view.focal, options.pixel_sigma_px)
-    depth = view.points[rows, 2].astype(np.float64) if with_depth else np.full(len(rows), np.nan)
-    return np.column_stack([view.xy[rows], sigma, depth, view.image_row[rows]])
-
-
-def adjusted_error_px(
-    query: View, keyframes: Sequence[KeyframeView], pairs: Pairs, adjusted: BundleResult
-) -> FloatArray:
-    """Distance ``[n]`` in pixels between the query's keypoints and the stored 3D points of `pairs`.
-
-    All images stand and turn as `adjusted` found; the points are those measured in the keyframes.
-    """
-    error = np.empty(len(pairs))
-    for slot, projected in enumerate(project_adjusted(query, keyframes, adjusted)):
-        here = pairs.slot == slot
-        offset = projected[pairs.keypoint[here]] - query.xy[pairs.query[here]] * query.focal
-        error[here] = np.hypot(offset[:, 0], offset[:, 1])
-    return np.where(np.isfinite(error), error, np.inf)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from semdb.geometry import invert_pose, pixels_to_normalized, transform_points
 from semdb.localization.matching import BACKGROUND
-from semdb.types import Camera, Float32Array, FloatArray, IntArray, Keypoints
+from semdb.types import Camera, Float32Array, FloatArray, ImageArray, IntArray, Keypoints
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,6 +30,7 @@ class View:
     signs: npt.NDArray[np.int8]  # [n] of the Laplacian, 0 where the feature has none
     points: Float32Array  # [n, 3] camera frame, NaN where there is no depth
     source: IntArray  # [n]
+    grey: ImageArray | None = None  # [H, W] the image, where it is at hand
 
     def __len__(self) -> int:
         return len(self.xy)
@@ -72,6 +73,7 @@ def make_view(
     numbers: ClassNumbers,
     *,
     with_points_only: bool = False,
+    grey: ImageArray | None = None,
 ) -> View:
     """The view of `keypoints`, whose object ``i`` is of class ``object_categories[i]``."""
     features = keypoints.features
@@ -91,6 +93,7 @@ def make_view(
         signs=features.laplacian[keep],
         points=keypoints.points[keep],
         source=keep.astype(np.int32),
+        grey=grey,
     )
 
 
@@ -101,9 +104,10 @@ def make_keyframe_view(
     keypoints: Keypoints,
     object_categories: Sequence[str],
     numbers: ClassNumbers,
+    grey: ImageArray | None = None,
 ) -> KeyframeView:
     """The view of a stored keyframe, with its points moved to the world."""
-    view = make_view(camera, keypoints, object_categories, numbers, with_points_only=True)
+    view = make_view(camera, keypoints, object_categories, numbers, with_points_only=True, grey=grey)
     return KeyframeView(
         keyframe_id=keyframe_id,
         view=view,

@@ -89,6 +89,7 @@ class Describer:
             dynamic=frozenset(self.rules.dynamic),
             sightings=sightings,
             timing_ms={"detect": detect_ms, "encode": encode_ms, "features": extract_ms + lift_ms},
+            grey=grey,
         )
 
     def _detect(
