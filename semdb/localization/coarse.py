@@ -2,8 +2,8 @@
 
 A cascade. First the keyframes that show most of what the query shows (the class-attribute filter: the best so many by
 class score), ranked by the cosine of the CNN vectors plus a term for the class score; where verification does not
-convince, all keyframes by the same sum; then all by cosine alone. Most queries are answered by the first stage, and a missed
-detection costs time instead of the answer.
+convince, all keyframes by the same sum; then all by cosine alone. Most queries are answered by the first stage, and a
+missed detection costs time instead of the answer.
 """
 
 from __future__ import annotations
