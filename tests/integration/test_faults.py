@@ -10,7 +10,7 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -21,8 +21,10 @@ from semdb.database.engine import make_engine
 from semdb.database.store import Store, open_store
 from semdb.errors import DatabaseUnavailableError, NotFoundError, UsageError
 from semdb.ingest import IngestOptions, ingest_recordings
+from semdb.queueing import sweep
 from semdb.recordings.synthetic import SyntheticOptions
 from semdb.settings import Settings
+from semdb.workers import ITEMS_TASK, make_app
 from tests import servers, services
 from tests.integration.comparison import rows_per_table
 from tests.integration.test_ingest import content
@@ -93,27 +95,37 @@ def test_thirty_killed_workers(long_room: Path, undisturbed: Store, mariadb_url:
         where = {"SEMDB_BROKER_URL": broker.url, **SPECS}
         queued = semdb("ingest", long_room, "--queue", "--stride", 1, "--map", "m", url=mariadb_url, **where)
         assert queued.returncode == 0, queued.stderr
+        app = make_app(Settings(broker_url=broker.url))
+
+        def send(recording_id: int, source: str, frames: Sequence[int]) -> None:
+            app.send_task(ITEMS_TASK, args=[recording_id, source, list(frames)])
 
         def worker() -> services.Worker:
             return services.start_worker(tmp_path, mariadb_url, broker.url, processes=2, **SPECS)
 
+        def reach(keyframes: int, running: list[services.Worker]) -> None:
+            """Waits for so many; what watches over services starts workers that ended, and sends what they had."""
+            while stored(store) < keyframes:
+                for place, one in enumerate(running):
+                    if one.process.poll() is not None:
+                        running[place] = worker()
+                        sweep(store, send, all_pending=True)
+                time.sleep(0.02)
+
+        kills = 0
         with services.workers(worker(), worker()) as running:
             for number, keyframes in enumerate(due):
-                services.wait_until(lambda n=keyframes: stored(store) >= n, f"{keyframes} keyframes", 120)
-                place = chance.randrange(2)
-                if number % 10 == 9:
-                    running[place].kill()
-                    running[place] = worker()
-                    continue
-                while not (children := running[place].children()):
-                    if running[place].process.poll() is not None:  # Celery ends when a process dies as it starts
-                        running[place] = worker()  # as whatever watches over services does
-                    time.sleep(0.02)
-                os.kill(chance.choice(children), signal.SIGKILL)
-            # Messages that killed workers held come back after a while; nobody has to wait for that.
-            resumed = semdb("ingest", "--resume", url=mariadb_url, **where)
-            assert resumed.returncode == 0, resumed.stderr
-            services.wait_until(lambda: is_complete(store), "all are stored", 120)
+                reach(keyframes, running)
+                victim = chance.choice(running)
+                children = victim.children()
+                if number % 10 == 9 or not children:
+                    victim.kill()
+                else:
+                    os.kill(chance.choice(children), signal.SIGKILL)
+                kills += 1
+            reach(FRAMES, running)
+            assert kills == KILLS
+            services.wait_until(lambda: is_complete(store), "the recording is complete")
         assert content(store) == content(undisturbed)
         assert store.failed_items() == []
 
