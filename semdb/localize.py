@@ -19,6 +19,7 @@ from semdb.model_choice import settings_of_map, specs_for_query
 from semdb.perception.describe import Describer, describer_from_specs
 from semdb.query_image import LikeCamera, QueryImage, QueryReader
 from semdb.recordings import open_recordings
+from semdb.refine import CLASSES
 from semdb.settings import Settings
 from semdb.types import Camera, Description, Localization, Verdict
 
@@ -74,6 +75,8 @@ def make_localizer(
     check_coarse(coarse)
     source = SqlSource(store, info.id) if coarse == "sql" else IndexSource(open_index(store, info.id, settings, say))
     confusions: dict[str, dict[str, int]] = {}
+    if say is not None and any(item.kind == CLASSES and not item.current for item in store.refinements(info.id)):
+        say(f"map {info.name!r} has changed since semdb refine; the class confusions of then are used")
     for found in store.class_confusions(info.id):
         confusions.setdefault(found.category, {})[found.other] = found.weight
     cache = KeyframeCache(store, info.id)

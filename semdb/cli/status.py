@@ -148,6 +148,10 @@ def show(store: Store, recordings: list[RecordingStatus], failed: list[FailedIte
         print(f"failed: {names[item.recording_id]} frame {item.frame_index}, attempt {item.attempts}: {item.error}")
     if len(failed) > ERRORS_SHOWN:
         print(f"and {len(failed) - ERRORS_SHOWN} more; --json lists all")
+    shown = {recording.map_id for recording in recordings}
+    for refined in store.refinements():
+        if refined.map_id in shown and not refined.current:
+            print(f"map {refined.map}: what semdb refine computed ({refined.kind}) is out of date")
 
 
 @settings_options(models=False)
