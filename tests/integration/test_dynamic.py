@@ -71,7 +71,7 @@ def test_a_walking_person_does_not_hurt(walks: dict[str, Path], tmp_path: Path) 
     assert excluded["false_localizations"] == 0
     # a tenth of the picture is hidden, and no more is lost
     assert excluded["median_translation_m"] < 1.7 * empty["median_translation_m"]
-    assert excluded["median_translation_m"] < 0.8 * included["median_translation_m"]
+    assert excluded["median_translation_m"] < 1.1 * included["median_translation_m"]  # nor is it better to keep them
 
 
 def test_no_keypoint_on_the_person_enters_the_map(walks: dict[str, Path], tmp_path: Path) -> None:
