@@ -44,17 +44,21 @@ def main() -> None:
     parser.add_argument("--work", type=Path, help="rendered rooms are kept here and found again")
     parser.add_argument("--again", type=Path, action="append", help="a file of --json to judge again")
     parser.add_argument("--fit", choices=(FIT, TEST), help="print the confidence's weights fitted on this half")
-    parser.add_argument("--every", type=int, default=1, help="ask only every n-th image")
+    parser.add_argument("--every", type=int, default=1, help="ask only every n-th image,")
+    parser.add_argument("--first", type=int, default=0, help="from this one on")
     arguments = parser.parse_args()
     if not (arguments.recordings or arguments.synthetic or arguments.again):
         parser.error("name recordings, or --synthetic, or a file with --again")
-    if arguments.again is not None:
-        rows = [row for path in arguments.again for row in load_rows(path)]
-    else:
-        with tempfile.TemporaryDirectory(prefix="semdb-trust-") as folder:
-            rows = list(_ask_all(arguments, arguments.work or Path(folder)))
-    if arguments.json is not None:
-        save_rows(arguments.json, rows)
+    rows: list[Row] = []
+    try:
+        if arguments.again is not None:
+            rows += [row for path in arguments.again for row in load_rows(path)]
+        else:
+            with tempfile.TemporaryDirectory(prefix="semdb-trust-") as folder:
+                rows.extend(_ask_all(arguments, arguments.work or Path(folder)))
+    finally:  # what was asked is kept, whatever ends it
+        if arguments.json is not None:
+            save_rows(arguments.json, rows)
     if arguments.plots is not None:
         save_plots(arguments.plots, rows)
     print(report(rows))
@@ -71,12 +75,14 @@ def _ask_all(arguments: argparse.Namespace, work: Path) -> Iterator[Row]:
     work.mkdir(parents=True, exist_ok=True)
     if arguments.synthetic:
         own = settings.model_copy(update={"detector": "recorded"})
-        yield from ask_world(rendered_world(work, _say), own, arguments.every, _say)
+        yield from ask_world(rendered_world(work, _say), own, arguments.every, arguments.first, _say)
     if arguments.recordings:
-        yield from ask_world(recorded_world(arguments.recordings, _say), settings, arguments.every, _say)
+        yield from ask_world(
+            recorded_world(arguments.recordings, _say), settings, arguments.every, arguments.first, _say
+        )
 
 
-def ask_world(world: World, settings: Settings, every: int, say: Say) -> Iterator[Row]:
+def ask_world(world: World, settings: Settings, every: int, first: int, say: Say) -> Iterator[Row]:
     """Makes the maps of a world in a database of their own and asks its queries."""
     with_masks = world.maps[0].recording.categories is not None
     specs = specs_for_ingest(settings, (), has_masks=with_masks)
@@ -86,7 +92,7 @@ def ask_world(world: World, settings: Settings, every: int, say: Say) -> Iterato
         half = {plan.name: plan.half for plan in world.maps}
         started, asked = time.perf_counter(), 0
         for number, query in enumerate(world.queries()):
-            if number % every:
+            if number % every != first:
                 continue
             for row in _ask(world.name, query, describer, localizers, half):
                 asked += 1

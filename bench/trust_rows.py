@@ -106,7 +106,9 @@ def normalised_errors(estimate: FloatArray, truth: FloatArray, covariance: Float
     error[:3] = estimate[:3, 3] - truth[:3, 3]
     error[3:] = Rotation.from_matrix(estimate[:3, :3] @ truth[:3, :3].T).as_rotvec()
     parts = (slice(0, 6), slice(0, 3), slice(3, 6))
-    whole, position, rotation = (float(error[p] @ np.linalg.solve(covariance[p, p], error[p])) for p in parts)
+    whole, position, rotation = (
+        float(error[p] @ np.linalg.pinv(covariance[p, p], hermitian=True) @ error[p]) for p in parts
+    )
     return whole, position, rotation
 
 

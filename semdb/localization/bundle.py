@@ -21,6 +21,8 @@ from semdb.types import Float32Array, FloatArray, IntArray
 
 CAUCHY_SQUARED = 4.0  # (2 sigma)^2: where the loss leaves the parabola
 QUERY = 0  # index of the query among the images
+PARAMETERS_OF_QUERY = 9
+SHARED_VARIANCE = 0.12  # of the assumed variance that is believed whatever the residuals (see `_covariance`)
 EVIDENCE_ROUNDS = 30
 FIRST_ITERATIONS = 4  # before the variances of the priors are known
 LEAST_GAIN = 1e-3  # of the cost; smaller ones move the pose by less than a tenth of its error
@@ -100,6 +102,7 @@ class _Blocks:
     points: FloatArray  # [m, 3, 3]
     point_gradients: FloatArray  # [m, 3]
     chi2: FloatArray  # [k]
+    own_gradients: FloatArray  # [k, 9] what each observation adds to its image's gradient
     cost: float = 0.0
 
 
@@ -121,13 +124,14 @@ class _Solver:
         m, c, k = len(state.points), self.images, len(self.observed)
         blocks = _Blocks(
             np.empty((c, 9, 9)), np.empty((c, 9)), np.empty((k, 9, 3)),
-            np.empty((m, 3, 3)), np.empty((m, 3)), np.empty(k),
+            np.empty((m, 3, 3)), np.empty((m, 3)), np.empty(k), np.empty((k, 9)),
         )  # fmt: skip
         poses = state.poses
         blocks.cost = normal_equations(
             state.points, np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), state.turn,
             self.problem.observed_point, self.problem.observed_image, self.observed, CAUCHY_SQUARED,
             blocks.images, blocks.image_gradients, blocks.coupling, blocks.points, blocks.point_gradients, blocks.chi2,
+            blocks.own_gradients,
         )  # fmt: skip
         offset = np.concatenate([state.shift, state.turn], axis=1)
         axis = np.arange(9)
@@ -292,10 +296,23 @@ def _evident_sigma(
 def _covariance(solver: _Solver, blocks: _Blocks, camera_from_world: FloatArray) -> FloatArray:
     """Covariance of the query's pose in the world, with all else marginalised out.
 
-    A step (t, w) of the camera moves its centre by -R t and turns it by -R w, R being world_from_camera.
+    The sandwich of Huber (1967) and White (1982): how large the errors are is read off the residuals, point by point,
+    and not taken from the noise that the weights assume; of that variance a share is kept, for what the points
+    have in common. A step (t, w) of the camera moves its centre by -R t and turns it by -R w, R being
+    world_from_camera.
     """
+    from semdb.localization.bundle_kernels import scatter_of_points
+
     reduced, _ = solver.reduced(blocks, 0.0)
-    in_camera = np.linalg.inv(reduced)[:6, :6]
+    prior = np.diag(solver.information.reshape(-1))
+    scatter, points = np.zeros_like(reduced), len(blocks.points)
+    scatter_of_points(
+        blocks.own_gradients, blocks.coupling, blocks.points, blocks.point_gradients, solver.first,
+        solver.problem.observed_image, scatter,
+    )  # fmt: skip
+    scatter *= points / max(points - PARAMETERS_OF_QUERY, 1)
+    inverse = np.linalg.inv(reduced)
+    in_camera = (inverse @ (scatter + SHARED_VARIANCE * (reduced - prior) + prior) @ inverse)[:6, :6]
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = -camera_from_world[:3, :3].T
     covariance: FloatArray = turn @ in_camera @ turn.T

@@ -92,12 +92,13 @@ def normal_equations(
     point_blocks: FloatArray,
     point_gradients: FloatArray,
     chi2: FloatArray,
+    own_gradients: FloatArray,
 ) -> float:
     """Fills the blocks (all after `cauchy`) and returns the robust cost.
 
     `rotation` ``[c, 3, 3]``, `translation` ``[c, 3]``: camera_from_world; `turn` ``[c, 3]`` radians per readout;
     `observed` ``[k, 6]`` is (x, y, sigma, depth, row, factor of the depth's noise). Filled: ``[c, 9, 9]``, ``[c, 9]``,
-    ``[k, 9, 3]``, ``[m, 3, 3]``, ``[m, 3]``, ``[k]``.
+    ``[k, 9, 3]``, ``[m, 3, 3]``, ``[m, 3]``, ``[k]``, and ``[k, 9]``: what each observation adds to the gradients.
     """
     image_blocks[:] = 0.0
     image_gradients[:] = 0.0
@@ -133,7 +134,7 @@ def normal_equations(
             )  # fmt: skip
             for j in range(3):
                 by_point[r, j] = a * pose[0, j] + b * pose[1, j] + d * pose[2, j]
-        _add(by_image, by_point, out, image_blocks[c], image_gradients[c], coupling[k])
+        _add(by_image, by_point, out, image_blocks[c], image_gradients[c], coupling[k], own_gradients[k])
         _add_point(by_point, out, point_blocks[n], point_gradients[n])
     for c in range(len(image_blocks)):
         for i in range(PARAMETERS):
@@ -150,11 +151,13 @@ def _add(
     block: FloatArray,
     gradient: FloatArray,
     coupling: FloatArray,
+    own: FloatArray,
 ) -> None:
     """Adds one observation to its image (upper triangle of `block`), and fills what couples image and point."""
     for i in range(PARAMETERS):
         a, b, c = by_image[0, i], by_image[1, i], by_image[2, i]
-        gradient[i] += a * out[0, 0] + b * out[0, 1] + c * out[0, 2]
+        own[i] = a * out[0, 0] + b * out[0, 1] + c * out[0, 2]
+        gradient[i] += own[i]
         for j in range(i, PARAMETERS):
             block[i, j] += a * by_image[0, j] + b * by_image[1, j] + c * by_image[2, j]
         for j in range(3):
@@ -220,6 +223,37 @@ def reduce_to_images(
                         reduced[one + i, two + j] -= (
                             a * coupling[other, j, 0] + b * coupling[other, j, 1] + c * coupling[other, j, 2]
                         )
+
+
+@kernel
+def scatter_of_points(
+    own_gradients: FloatArray,
+    coupling: FloatArray,
+    point_blocks: FloatArray,
+    point_gradients: FloatArray,
+    first: IntArray,
+    observed_image: IntArray,
+    scatter: FloatArray,
+) -> None:
+    """Adds to `scatter` ``[9c, 9c]`` the outer products of what each point, eliminated, adds to the gradient."""
+    inverse = np.empty((3, 3))
+    for n in range(len(point_blocks)):
+        invert_3x3(point_blocks[n], 0.0, inverse)
+        count = first[n + 1] - first[n]
+        pulls = np.empty((count, PARAMETERS))
+        for k in range(first[n], first[n + 1]):
+            for i in range(PARAMETERS):
+                total = own_gradients[k, i]
+                for j in range(3):
+                    for r in range(3):
+                        total -= coupling[k, i, r] * inverse[r, j] * point_gradients[n, j]
+                pulls[k - first[n], i] = total
+        for one in range(count):
+            for two in range(count):
+                row, column = PARAMETERS * observed_image[first[n] + one], PARAMETERS * observed_image[first[n] + two]
+                for i in range(PARAMETERS):
+                    for j in range(PARAMETERS):
+                        scatter[row + i, column + j] += pulls[one, i] * pulls[two, j]
 
 
 @kernel

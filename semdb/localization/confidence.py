@@ -11,19 +11,33 @@ from scipy.spatial import cKDTree
 from semdb.geometry import invert_pose, project, transform_points
 from semdb.localization.pose import PoseEstimate
 from semdb.localization.views import KeyframeView, View
-from semdb.types import BoolArray, Float32Array, FloatArray, IntArray
+from semdb.types import BoolArray, Float32Array, FloatArray
 
 GRID = 4  # cells along each side of the image
+LEAST_CELLS = 4  # fewer cells that keyframes show are too few to speak for a pose
 CELL_POINTS = 4  # so many points of keyframes must fall into a cell before it counts as one they show
 SUPPORTER_PAIRS = 6  # a keyframe with fewer inliers says nothing of its own
 NEAR_PX = 12.0  # a projected point and a keypoint this near are on the same thing
+SAME_PX = 4.0  # and this near they are at the same place
 LEAST_OBJECT_POINTS = 12  # fewer points on objects say nothing about classes
 NEUTRAL_CLASSES = 0.5  # agreement of classes where there is nothing to compare
 
-FEATURES = ("first inliers", "inliers", "agreement", "spread", "explained", "coverage", "classes", "rival", "sigma")
+FEATURES = (
+    "first inliers",
+    "inliers",
+    "agreement",
+    "spread",
+    "explained",
+    "query share",
+    "confirmed",
+    "coverage",
+    "classes",
+    "rival",
+    "sigma",
+)
 # Of the logistic model; fitted by ``python -m bench.trust --fit fit``. None is negative.
-WEIGHTS = (1.5, 1.5, 2.0, 2.0, 0.5, 2.0, 1.0, 2.0, 0.0)
-INTERCEPT = -12.0
+WEIGHTS = (0.4, 0.0, 6.0, 1.0, 0.1, 0.0, 0.0, 0.0, 0.0, 2.0, 0.4)
+INTERCEPT = -6.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +56,9 @@ class Evidence:
     supporters: int  # keyframes with at least six inlier pairs
     second: int  # inlier pairs of the second best keyframe
     explained: float  # of the keyframes' points that should be seen, those that are inliers
-    coverage: float  # of the cells in which keyframes' points should be seen, those that hold inliers
+    query_share: float  # of the query's keypoints, those that are inliers
+    confirmed: float  # of the keyframes' points that fall on a keypoint of the query, those that look like it
+    coverage: float  # of the cells in which keyframes' points should be seen (at least four), those that hold inliers
     classes: float  # of the objects' points that should be seen, those that lie on an object of their class
     class_points: int  # how many could be compared
     cosine: float  # of the best keyframe's CNN vector with the query's; NaN where it is not known
@@ -76,7 +92,7 @@ def gather_evidence(
     pairs = np.array([*estimate.per_keyframe, *[0] * (len(keyframes) - len(estimate.per_keyframe))], int)
     order = np.argsort(-pairs, kind="stable")
     supporters = [int(n) for n in order if pairs[n] >= SUPPORTER_PAIRS] or [int(order[0])]
-    explained, coverage, classes, class_points = _what_should_be_seen(query, keyframes, estimate, supporters)
+    explained, confirmed, coverage, classes, class_points = _what_should_be_seen(query, keyframes, estimate, supporters)
     known = np.asarray(cosines, float)
     best = known[supporters]
     others = np.delete(known, supporters)
@@ -96,6 +112,8 @@ def gather_evidence(
         supporters=int((pairs >= SUPPORTER_PAIRS).sum()),
         second=int(pairs[order[1]]) if len(pairs) > 1 else 0,
         explained=explained,
+        query_share=estimate.inliers / max(len(query), 1),
+        confirmed=confirmed,
         coverage=coverage,
         classes=classes,
         class_points=class_points,
@@ -106,16 +124,16 @@ def gather_evidence(
 
 def _what_should_be_seen(
     query: View, keyframes: Sequence[KeyframeView], estimate: PoseEstimate, supporters: Sequence[int]
-) -> tuple[float, float, float, int]:
-    """`explained`, `coverage`, `classes` and `class_points` of `Evidence`: points of the keyframes in the query.
+) -> tuple[float, float, float, float, int]:
+    """The last shares of `Evidence`, from `explained` on: points of the keyframes in the query.
 
     Under a right pose most of what the keyframes hold is there again; under a wrong one that a single repeated thing
-    supports, the rest is missing.
+    supports, the rest is missing. In a room of the same shapes the points fall on keypoints that look otherwise.
     """
     camera_from_world = invert_pose(estimate.world_from_camera)
     size = np.array([query.camera.width, query.camera.height], float)
     tree = cKDTree(query.seen_xy) if len(query) else None
-    seen = agreeing = 0
+    seen = agreeing = coincident = 0
     expected = np.zeros(GRID * GRID, int)
     same = compared = 0
     for slot in supporters:
@@ -128,14 +146,22 @@ def _what_should_be_seen(
         agreeing += estimate.per_keyframe[slot]
         cells = (pixels[inside] * GRID / size).astype(int)
         expected += np.bincount(cells[:, 1] * GRID + cells[:, 0], minlength=GRID * GRID)
-        if tree is not None and (query.classes >= 0).any():
-            counted, equal = _classes_agree(query, tree, pixels[inside], keyframe.view.classes[inside])
-            compared += counted
-            same += equal
+        if tree is None:
+            continue
+        distance, nearest = tree.query(pixels[inside], distance_upper_bound=NEAR_PX)
+        coincident += int(np.count_nonzero(distance < SAME_PX))
+        if (query.classes >= 0).any():
+            near = np.isfinite(distance)
+            theirs, ours = keyframe.view.classes[inside][near], query.classes[np.asarray(nearest)[near]]
+            counts = (theirs >= 0) | (ours >= 0)
+            compared += int(counts.sum())
+            same += int((counts & (theirs == ours)).sum())
     held = _cells_of(query.seen_xy[estimate.pairs.query], size)
     shown = expected >= CELL_POINTS
+    explained, confirmed = min(agreeing / max(seen, 1), 1.0), min(agreeing / max(coincident, 1), 1.0)
+    coverage = float((shown & held).sum() / max(shown.sum(), LEAST_CELLS))
     classes = same / compared if compared >= LEAST_OBJECT_POINTS else NEUTRAL_CLASSES
-    return min(agreeing / max(seen, 1), 1.0), float((shown & held).sum() / max(shown.sum(), 1)), classes, compared
+    return explained, confirmed, coverage, classes, compared
 
 
 def _cells_of(pixels: Float32Array, size: FloatArray) -> BoolArray:
@@ -146,17 +172,8 @@ def _cells_of(pixels: Float32Array, size: FloatArray) -> BoolArray:
     return held
 
 
-def _classes_agree(query: View, tree: cKDTree, pixels: FloatArray, classes: IntArray) -> tuple[int, int]:
-    """Of projected points next to a keypoint of the query, where either lies on an object: how many, of equal class."""
-    distance, nearest = tree.query(pixels, distance_upper_bound=NEAR_PX)
-    near = np.isfinite(distance)
-    theirs, ours = classes[near], query.classes[np.asarray(nearest)[near]]
-    counts = (theirs >= 0) | (ours >= 0)
-    return int(counts.sum()), int((counts & (theirs == ours)).sum())
-
-
 def confidence_features(evidence: Evidence) -> FloatArray:
-    """What the confidence is made of ``[9]``, in the order of `FEATURES`; each grows with what speaks for the pose."""
+    """What the confidence is made of ``[11]``, in the order of `FEATURES`; each grows with what speaks for the pose."""
     rival = evidence.rival / max(evidence.first_of_best, 1)
     return np.array(
         [
@@ -165,6 +182,8 @@ def confidence_features(evidence: Evidence) -> FloatArray:
             evidence.agreement,
             evidence.spread,
             np.log(max(evidence.explained, 0.003)),
+            np.log(max(evidence.query_share, 0.003)),
+            evidence.confirmed,
             evidence.coverage,
             evidence.classes,
             -min(rival, 1.5),
