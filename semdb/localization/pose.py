@@ -70,6 +70,9 @@ class PoseEstimate:
     agreement: float
     residual_px: float  # median reprojection error of the inliers
     spread: float  # 0..1: share of a 4x4 grid over the image that holds inliers
+    aligned: int = (
+        0  # pairs whose patches are alike to the pixel; 0 without images. Chance brings guided inliers, not these
+    )
 
 
 def join_pairs(matches: Sequence[Matches]) -> Pairs:
@@ -190,10 +193,12 @@ def estimate_pose(
         error = reprojection_px(query, camera_from_world, pairs.query, points)
         return _estimate(query, keyframes, pairs, error, camera_from_world, None, first, options)
     try:
-        pairs, error, refined = _refine(query, keyframes, pairs, points, agreeing, camera_from_world, options)
+        pairs, error, refined, aligned = _refine(query, keyframes, pairs, points, agreeing, camera_from_world, options)
     except np.linalg.LinAlgError:
         return None
-    return _estimate(query, keyframes, pairs, error, refined.camera_from_world, refined.covariance, first, options)
+    pose, covariance = refined.camera_from_world, refined.covariance
+    estimate = _estimate(query, keyframes, pairs, error, pose, covariance, first, options)
+    return None if estimate is None else replace(estimate, aligned=aligned)
 
 
 def _refine(
@@ -204,17 +209,18 @@ def _refine(
     agreeing: BoolArray,
     camera_from_world: FloatArray,
     options: PoseOptions,
-) -> tuple[Pairs, FloatArray, BundleResult]:
+) -> tuple[Pairs, FloatArray, BundleResult, int]:
     """Bundle adjustment; with guided matching once roughly, then again over what matches near its projections.
 
-    For that the patches of the keyframes are aligned in the query. Returns the pairs with their errors in pixels.
+    For that the patches of the keyframes are aligned in the query. Returns the pairs with their errors in pixels,
+    and how many were aligned.
     Raises numpy.linalg.LinAlgError where the pose is not determined.
     """
     used = pairs.take(agreeing)
     if not options.guided:
         unaligned = Alignment(query.xy[used.query], np.zeros(len(used), np.bool_))
         adjusted = bundle_adjust(query, keyframes, used, points[agreeing], camera_from_world, options, unaligned)
-        return pairs, adjusted_error_px(query, keyframes, pairs, adjusted), adjusted
+        return pairs, adjusted_error_px(query, keyframes, pairs, adjusted), adjusted, 0
     adjusted = bundle_adjust(query, keyframes, used, points[agreeing], camera_from_world, options)
     matching = replace(options.matching, guided_radius_px=options.close_radius_px)
     pairs = guided_pairs(query, keyframes, project_adjusted(query, keyframes, adjusted), matching)
@@ -224,7 +230,8 @@ def _refine(
     used, points = pairs.take(agreeing), world_points_of(pairs, keyframes)[agreeing]
     alignment = align_pairs(query, keyframes, used.query, used.slot, used.keypoint, adjusted)
     adjusted = bundle_adjust(query, keyframes, used, points, adjusted.camera_from_world, options, alignment)
-    return pairs, adjusted_error_px(query, keyframes, pairs, adjusted), adjusted
+    aligned = int(np.count_nonzero(alignment.found))
+    return pairs, adjusted_error_px(query, keyframes, pairs, adjusted), adjusted, aligned
 
 
 def _project(query: View, keyframes: Sequence[KeyframeView], camera_from_world: FloatArray) -> list[FloatArray]:
