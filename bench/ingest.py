@@ -162,33 +162,54 @@ def measure_writer(keyframes: int = 200) -> dict[str, Any]:
 
 
 def measure_memory(frames: int) -> dict[str, Any]:
-    """Resident memory in MiB, in tenths of an ingest of `frames` frames of which all become keyframes."""
-    from semdb.recordings.synthetic import SyntheticOptions, write_synthetic_recording
-
+    """Resident memory in MiB after a selection, and in tenths of an ingest, of `frames` frames (all keyframes)."""
     settings = load_settings(detector="recorded", encoder="gist", features="orb")
     seen: list[float] = []
-    with tempfile.TemporaryDirectory() as folder:
-        room = Path(folder) / "room"
-        write_synthetic_recording(room, SyntheticOptions(frames=frames, width=160, height=120))
-        [recording] = open_recordings(room)
+
+    def note(what: str, done: int, total: int) -> None:
+        if done % max(1, total // 10) == 0:
+            seen.append(_resident_mib())
+            print(f"{what}: {done} of {total}, {seen[-1]:.0f} MiB", file=sys.stderr, flush=True)
+
+    with tempfile.TemporaryDirectory() as folder, open_store(f"sqlite:///{folder}/a.sqlite3", create=True) as store:
+        _write_long_recording(Path(folder) / "room", frames)
+        [recording] = open_recordings(Path(folder) / "room")
         describers = make_describers(specs_for_ingest(settings, (), has_masks=True), settings)
-
-        def note(what: str, done: int, total: int) -> None:
-            if done % max(1, total // 10) == 0:
-                seen.append(_resident_mib())
-                print(f"{what}: {done} of {total}, {seen[-1]:.0f} MiB", file=sys.stderr, flush=True)
-
-        with open_store(f"sqlite:///{folder}/bench.sqlite3", create=True) as store:
-            started = time.perf_counter()
-            options = IngestOptions(map_name="m", keyframes=frames)
-            summary = ingest_recording(recording, store, describers, options, progress=note)
-            seconds = time.perf_counter() - started
+        before = _resident_mib()
+        select_keyframes(recording, count=50)
+        selected = _resident_mib()
+        started = time.perf_counter()
+        summary = ingest_recording(recording, store, describers, IngestOptions(map_name="m", stride=1), progress=note)
+        seconds = time.perf_counter() - started
     return {
         "frames": frames,
         "stored": summary.stored,
         "per_s": frames / seconds,
-        "resident_mib": [round(m) for m in seen],
+        "opened_mib": round(before),
+        "selected_mib": round(selected),
+        "ingest_mib": [round(value) for value in seen],
     }
+
+
+def _write_long_recording(room: Path, frames: int, rendered: int = 500) -> None:
+    """A walk of `rendered` frames, repeated under later times: links to the same files."""
+    from semdb.recordings.synthetic import SyntheticOptions, write_synthetic_recording
+
+    write_synthetic_recording(room, SyntheticOptions(frames=min(frames, rendered), width=160, height=120))
+    stems = [path.stem for path in sorted((room / "rgb").iterdir(), key=lambda path: float(path.stem))]
+    poses = [line.split(maxsplit=1)[1] for line in (room / "groundtruth.txt").read_text().splitlines()[2:]]
+    lines: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
+    for number in range(len(stems), frames):
+        old, place = stems[number % len(stems)], number % len(stems)
+        new = f"{float(old) + 1000 * (number // len(stems)):.6f}"
+        for name in ("rgb", "depth", "masks"):
+            (room / name / f"{new}.png").hardlink_to(room / name / f"{old}.png")
+        for name in ("rgb", "depth"):
+            lines[name].append(f"{new} {name}/{new}.png\n")
+        lines["groundtruth"].append(f"{new} {poses[place]}\n")
+    for name, added in lines.items():
+        with (room / f"{name}.txt").open("a") as file:
+            file.writelines(added)
 
 
 def _resident_mib() -> float:
