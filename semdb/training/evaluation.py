@@ -79,7 +79,8 @@ def evaluate_detector(detector: Detector, data: CocoData, progress: Progress | N
         truth.createIndex()
         scores = {kind: _scores(truth, found, data, kind) for kind in ("bbox", "segm")}
     objects = sum(len(picture.instances) for picture in data.pictures)
-    per_class = dict(zip(data.classes[1:], scores["bbox"][1], strict=True))
+    in_order = [data.classes[1 + k] for k in np.argsort(data.category_ids)]  # the evaluator sorts classes by id
+    per_class = dict(zip(in_order, scores["bbox"][1], strict=True))
     return DetectorScores(scores["bbox"][0], scores["segm"][0], per_class, len(data.pictures), objects)
 
 

@@ -230,6 +230,8 @@ def test_scores_of_detectors_that_are_known(shapes: Path) -> None:
     half = evaluate_detector(Perfect(shapes, drop="disc"), data)
     assert half.boxes.ap == pytest.approx(0.5)
     assert half.class_ap50 == pytest.approx({"disc": 0, "square": 1})
+    turned = evaluate_detector(Perfect(shapes, drop="disc"), load_coco(shapes, "train", ["square", "disc"]))
+    assert turned.class_ap50 == pytest.approx({"disc": 0, "square": 1})
     nothing = evaluate_detector(Perfect(shapes, drop="disc"), load_coco(shapes, "train", ["disc"]))
     assert nothing.boxes.values == nothing.masks.values == (0, 0, 0, 0)
 
