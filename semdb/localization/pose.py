@@ -70,9 +70,7 @@ class PoseEstimate:
     agreement: float
     residual_px: float  # median reprojection error of the inliers
     spread: float  # 0..1: share of a 4x4 grid over the image that holds inliers
-    aligned: int = (
-        0  # pairs whose patches are alike to the pixel; 0 without images. Chance brings guided inliers, not these
-    )
+    aligned: int = 0  # pairs whose patches are alike to a fraction of a pixel; 0 without images
 
 
 def join_pairs(matches: Sequence[Matches]) -> Pairs:
