@@ -1,0 +1,158 @@
+"""Planning for workers and doing what messages say, without a broker; recordings behind URLs; mounts that are lost."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import fsspec
+import pytest
+
+from semdb.cli.status import Rates
+from semdb.database import items
+from semdb.database.reporting import workers
+from semdb.database.retry import MAY_HEAL, task_delay_s
+from semdb.database.store import Store, open_store
+from semdb.errors import RecordingError, RecordingUnavailableError, UsageError
+from semdb.ingest import IngestOptions, ingest_recordings
+from semdb.queueing import CHUNK, Workplace, queue_recordings, sweep
+from semdb.recordings.source import fetch, parse_source, write_source
+from semdb.settings import Settings
+from tests.integration.test_ingest import content
+
+Message = tuple[int, str, tuple[int, ...]]
+
+
+class Outbox(list[Message]):
+    """Messages that were sent."""
+
+    def send(self, recording_id: int, source: str, frames: Sequence[int]) -> None:
+        self.append((recording_id, source, tuple(frames)))
+
+
+def settings(url: str, cache: Path) -> Settings:
+    made = {"detector": "recorded", "encoder": "gist", "features": "orb", "threads": 2}
+    return Settings(database_url=url, cache_dir=cache, **made)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def expected(room: Path, tmp_path: Path) -> Iterator[Store]:
+    """All 24 frames, ingested in one go."""
+    url = f"sqlite:///{tmp_path / 'expected.sqlite3'}"
+    ingest_recordings([room], settings(url, tmp_path), IngestOptions(stride=1, map_name="m"))
+    with open_store(url) as store:
+        yield store
+
+
+def test_messages_in_any_order_and_twice(room: Path, expected: Store, database_url: str, tmp_path: Path) -> None:
+    outbox, own = Outbox(), settings(database_url, tmp_path)
+    [summary] = queue_recordings([str(room)], own, IngestOptions(stride=1, map_name="m"), outbox.send)
+    assert (summary.planned, summary.stored) == (24, 0)
+    assert [len(frames) for _, _, frames in outbox] == [CHUNK, 24 - CHUNK]
+    with open_store(database_url) as store:
+        assert sweep(store, outbox.send) == 0  # they are on their way
+        assert sweep(store, outbox.send, all_pending=True) == 24
+    place = Workplace(own)
+    outcomes = [place.do(*message) for message in reversed(outbox)]
+    assert [outcome.stored for outcome in outcomes] == [24 - CHUNK, CHUNK, 0, 0]
+    assert [outcome.complete for outcome in outcomes] == [False, True, True, True]
+    with open_store(database_url) as store:
+        frames = content(store)["frames"]
+        assert frames == content(expected)["frames"]
+
+
+def test_a_worker_that_is_to_stop_finishes_what_it_is_at(room: Path, tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'a.sqlite3'}"
+    outbox, own = Outbox(), settings(url, tmp_path)
+    queue_recordings([str(room)], own, IngestOptions(stride=1, map_name="m"), outbox.send)
+    done: list[int] = []
+    outcome = Workplace(own).do(*outbox[0], stop=lambda: bool(done), note=lambda item: done.append(1))
+    assert 1 <= outcome.stored < CHUNK
+    assert outcome.stored == len(done)
+    assert len(outcome.left) == CHUNK - outcome.stored
+    with open_store(url) as store:
+        assert items.left(store.engine, 1) == (24 - outcome.stored, 0)  # nothing is held any more
+        assert workers(store.engine) == []
+
+
+def test_a_lost_mount_is_waited_for_and_a_deleted_recording_is_not(room: Path, tmp_path: Path) -> None:
+    url, away, mount = f"sqlite:///{tmp_path / 'a.sqlite3'}", tmp_path / "away", tmp_path / "mount"
+    mount.symlink_to(room)
+    outbox, own = Outbox(), settings(url, tmp_path)
+    queue_recordings([str(mount)], own, IngestOptions(stride=4, map_name="m"), outbox.send)
+    mount.rename(away)
+    place = Workplace(own)
+    with pytest.raises(RecordingUnavailableError, match="no such folder on this machine") as caught:
+        place.do(*outbox[0])
+    assert isinstance(caught.value, MAY_HEAL)
+    with open_store(url) as store:
+        assert items.left(store.engine, 1) == (6, 0)
+        assert store.failed_items() == []
+        away.rename(mount)
+        assert place.do(*outbox[0]).stored == 6
+        store.delete_recording(1)
+    assert place.do(*outbox[0]).stored == 0
+
+
+def test_pauses_between_tasks_grow_up_to_a_limit() -> None:
+    pauses = [task_delay_s(retries) for retries in range(12)]
+    assert 1.0 <= pauses[0] <= 2.0
+    assert 150 <= pauses[-1] <= 300
+    assert task_delay_s(10_000) <= 300
+
+
+@pytest.mark.parametrize("kind", ["file", "memory"])
+def test_a_recording_behind_a_url(room: Path, expected: Store, tmp_path: Path, kind: str) -> None:
+    address = f"file://{room}"
+    if kind == "memory":
+        address = f"memory://{tmp_path.name}/room"
+        system = fsspec.filesystem("memory")
+        for path in sorted(room.rglob("*")):
+            if path.is_file():
+                system.pipe(f"/{tmp_path.name}/room/{path.relative_to(room)}", path.read_bytes())
+    url = f"sqlite:///{tmp_path / 'a.sqlite3'}"
+    outbox, own = Outbox(), settings(url, tmp_path / "cache")
+    [summary] = queue_recordings([address], own, IngestOptions(stride=1, map_name="m"), outbox.send)
+    assert summary.recording == "room"
+    assert {source for _, source, _ in outbox} == {address}
+    place = Workplace(settings(url, tmp_path / "another machine"))
+    assert sum(place.do(*message).stored for message in outbox) == 24
+    with open_store(url) as store:
+        assert content(store) == content(expected)
+        assert store.status()[0].source == address
+
+
+def test_only_what_is_missing_is_fetched(room: Path, tmp_path: Path) -> None:
+    folder = fetch(f"file://{room}", tmp_path)
+    images = sorted((folder / "rgb").iterdir())
+    assert [path.read_bytes() for path in images] == [path.read_bytes() for path in sorted((room / "rgb").iterdir())]
+    before = images[1].stat().st_mtime_ns
+    images[0].write_bytes(b"half")
+    fetch(f"file://{room}", tmp_path)
+    assert images[0].read_bytes() == (room / "rgb" / images[0].name).read_bytes()
+    assert images[1].stat().st_mtime_ns == before
+
+
+def test_urls_that_lead_nowhere(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="there is nothing there"):
+        fetch("memory://nothing/here", tmp_path)
+    with pytest.raises(UsageError, match="no-such-system"):
+        fetch("no-such-system://room", tmp_path)
+
+
+def test_a_camera_that_was_given_travels_with_the_source() -> None:
+    source = write_source("s3://bucket/room", "500,510,320,240")
+    address, camera = parse_source(source)
+    assert (address, camera.fx if camera else None, camera.fy if camera else None) == ("s3://bucket/room", 500, 510)
+    assert parse_source("/data/room") == ("/data/room", None)
+
+
+def test_rates_of_the_last_looks() -> None:
+    rates = Rates(window_s=10)
+    rates.look({1: 5}, now_s=100)
+    assert rates.per_second(1) is None
+    rates.look({1: 25, 2: 3}, now_s=104)
+    assert rates.per_second(1) == 5.0
+    assert rates.per_second(2) is None
+    rates.look({1: 25, 2: 3}, now_s=113)
+    assert rates.per_second(1) == 0.0
