@@ -18,7 +18,7 @@ from semdb.database.records import PlannedRecording, RecordingPlan
 from semdb.database.requeue import requeue_failed
 from semdb.database.store import Store, open_store
 from semdb.errors import UsageError
-from semdb.item_work import STAGES, Item, work_off
+from semdb.item_work import STAGES, Item, log_item, work_off
 from semdb.keyframes import select_keyframes
 from semdb.model_choice import ModelSpecs, settings_of_map, specs_for_ingest
 from semdb.perception.describe import Describer, describer_from_specs
@@ -168,6 +168,7 @@ def ingest_recording(
             recording, summary.recording_id, store, describers, descriptor_dtype=options.descriptor_dtype
         ):
             _count(summary, item)
+            log_item(summary.recording_id, item)
             done += 1
             if progress is not None:
                 progress(f"ingesting {recording.name}", min(done, todo), todo)

@@ -11,12 +11,14 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from queue import SimpleQueue
+from typing import Any
 
 from semdb.database import items
 from semdb.database.items import Claim
 from semdb.database.records import KeyframeRecord
 from semdb.database.store import Store
 from semdb.errors import DatabaseError, FrameError, LeaseLostError, RecordingUnavailableError, UsageError
+from semdb.events import event
 from semdb.perception.describe import Describer
 from semdb.pipeline import Stage, overlapped
 from semdb.recordings.base import FrameEntry, Recording
@@ -39,6 +41,17 @@ class Item:
     objects: int = 0
     keypoints: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def outcome(self) -> str:
+        """``stored``, ``failed`` or ``lost``; for an item that is done."""
+        return "lost" if self.lost else "failed" if self.error is not None else "stored"
+
+
+def log_item(recording_id: int, item: Item) -> None:
+    """Logs the event that a keyframe is done."""
+    seconds: dict[str, Any] = {stage: round(value, 4) for stage, value in item.seconds.items()}
+    event(item.outcome, recording=recording_id, frame=item.claim.frame_index, error=item.error, **seconds)
 
 
 def work_off(

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from semdb.database import items
 from semdb.database.planning import StoredPlan, stored_plan
@@ -183,8 +182,3 @@ class Workplace:
         if key not in self._describers:
             self._describers = {key: make_describers(specs, own)}  # of one map at a time: networks are large
         return self._describers[key]
-
-
-def source_path(source: str) -> Path:
-    """The folder or file name in a source, for messages."""
-    return Path(parse_source(source)[0])

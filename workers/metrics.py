@@ -35,8 +35,7 @@ def count(item: Any) -> None:
     """Counts a keyframe that is done."""
     if not _metrics:
         return
-    outcome = "lost" if item.lost else "failed" if item.error is not None else "stored"
-    _metrics["keyframes"].labels(outcome).inc()
+    _metrics["keyframes"].labels(item.outcome).inc()
     for stage, seconds in item.seconds.items():
         _metrics["seconds"].labels(stage).inc(seconds)
 

@@ -10,6 +10,7 @@ from celery.exceptions import SoftTimeLimitExceeded
 from semdb.database import retry
 from semdb.errors import SemdbError
 from semdb.events import event
+from semdb.item_work import log_item
 from semdb.queueing import Workplace
 from semdb.settings import Settings
 
@@ -30,8 +31,7 @@ def ingest_items(self: Any, recording_id: int, source: str, frames: Sequence[int
 
     def note(item: Any) -> None:
         metrics.count(item)
-        kind = "lost" if item.lost else "failed" if item.error is not None else "stored"
-        event(kind, recording=recording_id, frame=item.claim.frame_index, error=item.error, **item.seconds)
+        log_item(recording_id, item)
 
     try:
         outcome = _workplaces[0].do(recording_id, source, frames, stop=stopping.is_set, note=note)

@@ -14,6 +14,9 @@ from pathlib import Path
 import pytest
 
 from semdb.events import LOGGER, event, log_to
+from semdb.recordings.images import PNG_END
+from semdb.recordings.synthetic import SyntheticOptions
+from tests.rooms import render, semdb
 
 
 @pytest.fixture
@@ -63,3 +66,17 @@ def test_a_password_on_the_command_line_is_overwritten_in_the_list_of_processes(
     finally:
         process.kill()
         process.wait()
+
+
+def test_an_ingest_logs_each_keyframe_on_request(tmp_path: Path) -> None:
+    render(tmp_path / "room", SyntheticOptions(frames=3, width=64, height=48))
+    (tmp_path / "room" / "rgb" / "1.033333.png").write_bytes(
+        (tmp_path / "room" / "rgb" / "1.033333.png").read_bytes()[:-30] + bytes(18) + PNG_END
+    )
+    url = f"sqlite:///{tmp_path / 'a.sqlite3'}"
+    chosen = {"SEMDB_FEATURES": "orb", "SEMDB_LOG_FORMAT": "json"}
+    done = semdb("ingest", tmp_path / "room", "--stride", 1, url=url, **chosen)
+    events = [json.loads(line) for line in done.stderr.splitlines() if line.startswith("{")]
+    assert [(line["event"], line["frame"]) for line in events] == [("stored", 0), ("failed", 1), ("stored", 2)]
+    assert "1.033333.png" in events[1]["error"]
+    assert set(events[0]) >= {"time", "level", "recording", "read", "detect", "encode", "features", "store"}
