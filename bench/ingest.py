@@ -21,6 +21,8 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
+import cv2
+
 from semdb.cli.options import load_settings
 from semdb.database.store import Store, open_store
 from semdb.ingest import IngestOptions, ingest_recording, make_describers, plan_ingest
@@ -99,6 +101,7 @@ def _overlapped(recording: Recording, store: Store, describers: list[Describer],
 def _in_turn(recording: Recording, store: Store, describers: list[Describer], entries: list[FrameEntry]) -> None:
     """The same steps of the same keyframes, one after the other in this thread."""
     options = IngestOptions(map_name="m")
+    cv2.setNumThreads(1)
     summary, _ = plan_ingest(recording, store, describers[0].models, options, entries=entries)
     idle: SimpleQueue[Describer] = SimpleQueue()
     idle.put(describers[0])
