@@ -10,6 +10,7 @@ confidence that this half of the scenes gives.
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 import tempfile
 import time
@@ -50,6 +51,7 @@ def main() -> None:
     if not (arguments.recordings or arguments.synthetic or arguments.again):
         parser.error("name recordings, or --synthetic, or a file with --again")
     rows: list[Row] = []
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(1))  # as Ctrl-C: through the `finally` below
     try:
         if arguments.again is not None:
             rows += [row for path in arguments.again for row in load_rows(path)]
@@ -97,7 +99,7 @@ def ask_world(world: World, settings: Settings, every: int, first: int, say: Say
             for row in _ask(world.name, query, describer, localizers, half):
                 asked += 1
                 yield row
-            if number % 100 == 0:
+            if number // every % 50 == 0:
                 say(f"{world.name}: {asked} queries asked, {time.perf_counter() - started:.0f} s")
 
 

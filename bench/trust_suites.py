@@ -113,6 +113,18 @@ class _Views:
         return float(ViewStack(grids, poses).overlap_with(0)[1:].max())
 
 
+def _in_turn(parts: Sequence[Iterator[Query]]) -> Iterator[Query]:
+    """One of each part after the other, so that what is cut off is cut off everywhere."""
+    waiting = list(parts)
+    while waiting:
+        for part in tuple(waiting):
+            found = next(part, None)
+            if found is None:
+                waiting.remove(part)
+            else:
+                yield found
+
+
 def _picture(recording: Recording, entry: FrameEntry) -> Picture:
     return Picture(recording.read_image(entry), recording.camera, recording.read_instances(entry))
 
@@ -213,17 +225,17 @@ def rendered_world(work: Path, say: Say, size: RenderedSize | None = None) -> Wo
         maps.append(MapPlan(f"{scene.name}-part", scene.half, scene.recording, scene.part))
 
     def queries() -> Iterator[Query]:
-        for scene in rooms:
-            others = [s for s in (*rooms, *offices) if s.half == scene.half and s is not scene]
-            yield from _queries_of_room(scene, others)
-        for scene in offices:
-            yield from _queries_of_office(scene, [s for s in rooms if s.half == scene.half])
         for seed, half in enumerate((FIT, TEST)):
             asked = tuple(Asked(s.name, "no place at all", NEGATIVE) for s in (*rooms, *offices) if s.half == half)
             if not asked:
                 continue
             camera = rooms[0].recording.camera
             yield from _nothing(camera, seed, asked, rooms[0].recording.categories is not None)
+        parts = [_queries_of_office(scene, [s for s in rooms if s.half == scene.half]) for scene in offices]
+        for scene in rooms:
+            others = [s for s in (*rooms, *offices) if s.half == scene.half and s is not scene]
+            parts.append(_queries_of_room(scene, others))
+        yield from _in_turn(parts)
 
     return World("rendered", tuple(maps), queries)
 
@@ -318,13 +330,15 @@ def recorded_world(paths: Sequence[Path], say: Say, queries_each: int = 60) -> W
         maps += [MapPlan(name, half, recording, entries) for name, entries in own.items()]
 
     def queries() -> Iterator[Query]:
+        parts = []
         for number, recording in enumerate(recordings):
             foreign = [
                 name for r in recordings if r is not recording for name in sizes[r.name] if not name.endswith("-part")
             ]
-            yield from _queries_of_recording(recording, sizes[recording.name], foreign, queries_each)
+            parts.append(_queries_of_recording(recording, sizes[recording.name], foreign, queries_each))
             asked = tuple(Asked(name, "no place at all", NEGATIVE) for name in list(sizes[recording.name])[:2])
-            yield from _nothing(recording.camera, number, asked, recording.categories is not None)
+            parts.append(_nothing(recording.camera, number, asked, recording.categories is not None))
+        yield from _in_turn(parts)
 
     return World("recorded", tuple(maps), queries)
 

@@ -29,6 +29,7 @@ FEATURES = (
     "spread",
     "explained",
     "query share",
+    "aligned",
     "confirmed",
     "coverage",
     "classes",
@@ -36,7 +37,7 @@ FEATURES = (
     "sigma",
 )
 # Of the logistic model; fitted by ``python -m bench.trust --fit fit``. None is negative.
-WEIGHTS = (0.4, 0.0, 6.0, 1.0, 0.1, 0.0, 0.0, 0.0, 0.0, 2.0, 0.4)
+WEIGHTS = (0.4, 0.0, 6.0, 1.0, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 2.0, 0.4)
 INTERCEPT = -6.0
 
 
@@ -57,6 +58,7 @@ class Evidence:
     second: int  # inlier pairs of the second best keyframe
     explained: float  # of the keyframes' points that should be seen, those that are inliers
     query_share: float  # of the query's keypoints, those that are inliers
+    aligned: float  # of the inlier pairs, those whose patches are alike to the pixel
     confirmed: float  # of the keyframes' points that fall on a keypoint of the query, those that look like it
     coverage: float  # of the cells in which keyframes' points should be seen (at least four), those that hold inliers
     classes: float  # of the objects' points that should be seen, those that lie on an object of their class
@@ -113,6 +115,7 @@ def gather_evidence(
         second=int(pairs[order[1]]) if len(pairs) > 1 else 0,
         explained=explained,
         query_share=estimate.inliers / max(len(query), 1),
+        aligned=estimate.aligned / max(len(estimate.pairs), 1),
         confirmed=confirmed,
         coverage=coverage,
         classes=classes,
@@ -173,7 +176,7 @@ def _cells_of(pixels: Float32Array, size: FloatArray) -> BoolArray:
 
 
 def confidence_features(evidence: Evidence) -> FloatArray:
-    """What the confidence is made of ``[11]``, in the order of `FEATURES`; each grows with what speaks for the pose."""
+    """What the confidence is made of ``[12]``, in the order of `FEATURES`; each grows with what speaks for the pose."""
     rival = evidence.rival / max(evidence.first_of_best, 1)
     return np.array(
         [
@@ -183,6 +186,7 @@ def confidence_features(evidence: Evidence) -> FloatArray:
             evidence.spread,
             np.log(max(evidence.explained, 0.003)),
             np.log(max(evidence.query_share, 0.003)),
+            evidence.aligned,
             evidence.confirmed,
             evidence.coverage,
             evidence.classes,
