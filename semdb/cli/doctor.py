@@ -124,9 +124,7 @@ def broker(settings: Settings) -> Iterator[Check]:
         from kombu import Connection
         from kombu.exceptions import OperationalError
     except ImportError:
-        yield Check(
-            "problem", "broker", "the worker extra is missing: pip install 'semdb[worker]'"
-        )
+        yield Check("problem", "broker", "the worker extra is missing: pip install 'semdb[worker]'")
         return
     with Connection(settings.broker_url, connect_timeout=5) as connection:
         where = connection.as_uri()  # without the password

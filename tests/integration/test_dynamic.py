@@ -32,7 +32,8 @@ def walks(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def evaluate(recording: Path, folder: Path, *options: str) -> dict[str, Any]:
     name = f"{recording.name}{'-'.join(options)}.json"
     done = semdb(
-        *("evaluate", recording, "--keyframes", 9, "--max-queries", 20, "--json", folder / name, *options), url=f"sqlite:///{folder}/unused"
+        *("evaluate", recording, "--keyframes", 9, "--max-queries", 20, "--json", folder / name, *options),
+        url=f"sqlite:///{folder}/unused",
     )
     assert done.returncode == 0, done.stderr
     content = json.loads((folder / name).read_text())
