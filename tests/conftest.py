@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,6 +14,11 @@ from tests.mariadb import MariaDBError, TestServer, server
 from tests.rooms import render
 
 REPOSITORY = Path(__file__).resolve().parent.parent
+
+# What a developer has set is not what is tested; commands that are cut off hear Ctrl-C, also below `nohup ... &`.
+for _name in [name for name in os.environ if name.startswith("SEMDB_") and not name.startswith("SEMDB_TEST_")]:
+    del os.environ[_name]
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
