@@ -20,7 +20,7 @@ SUPPORTER_PAIRS = 6  # a keyframe with fewer inliers says nothing of its own
 NEAR_PX = 12.0  # a projected point and a keypoint this near are on the same thing
 SAME_PX = 4.0  # and this near they are at the same place
 LEAST_OBJECT_POINTS = 12  # fewer points on objects say nothing about classes
-NEUTRAL_CLASSES = 0.5  # agreement of classes where there is nothing to compare
+NEUTRAL = 0.5  # of classes where there is nothing to compare, of patches where there are no images
 
 FEATURES = (
     "first inliers",
@@ -37,8 +37,8 @@ FEATURES = (
     "sigma",
 )
 # Of the logistic model; fitted by ``python -m bench.trust --fit fit``. None is negative.
-WEIGHTS = (0.4, 0.0, 6.0, 1.0, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 2.0, 0.4)
-INTERCEPT = -6.0
+WEIGHTS = (0.350, 0.0, 2.908, 3.865, 0.0, 1.269, 0.0, 3.209, 0.0, 0.0, 1.444, 0.600)
+INTERCEPT = -5.467
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +115,7 @@ def gather_evidence(
         second=int(pairs[order[1]]) if len(pairs) > 1 else 0,
         explained=explained,
         query_share=estimate.inliers / max(len(query), 1),
-        aligned=estimate.aligned / max(len(estimate.pairs), 1),
+        aligned=NEUTRAL if query.grey is None else min(estimate.aligned / max(len(estimate.pairs), 1), 1.0),
         confirmed=confirmed,
         coverage=coverage,
         classes=classes,
@@ -163,7 +163,7 @@ def _what_should_be_seen(
     shown = expected >= CELL_POINTS
     explained, confirmed = min(agreeing / max(seen, 1), 1.0), min(agreeing / max(coincident, 1), 1.0)
     coverage = float((shown & held).sum() / max(shown.sum(), LEAST_CELLS))
-    classes = same / compared if compared >= LEAST_OBJECT_POINTS else NEUTRAL_CLASSES
+    classes = same / compared if compared >= LEAST_OBJECT_POINTS else NEUTRAL
     return explained, confirmed, coverage, classes, compared
 
 

@@ -35,6 +35,7 @@ class VerdictOptions:
     minimum_spread: float = 0.19  # three cells of a 4x4 grid over the image
     maximum_translation_sigma_m: float = 0.035
     maximum_rotation_sigma_deg: float = 1.5
+    localized_confidence: float = 0.8
     rival_share: float = 0.7  # of the first inliers with the best keyframe, that a pose elsewhere may have at most
 
 
@@ -96,6 +97,8 @@ def judge(evidence: Evidence | None, options: VerdictOptions) -> Judgement:
     # like with like: nothing that a pose has guided, and one keyframe, since of a place elsewhere one was asked
     if evidence.rival > options.rival_share * evidence.first_of_best:
         doubts.append(f"a pose elsewhere has {evidence.rival} against {evidence.first_of_best} inliers")
+    if confidence < options.localized_confidence:
+        doubts.append(f"all evidence together makes it {confidence:.0%} likely to be right")
     if doubts:
-        return Judgement(Verdict.AMBIGUOUS, min(confidence, 0.5), "; ".join(doubts))
+        return Judgement(Verdict.AMBIGUOUS, confidence, "; ".join(doubts))
     return Judgement(Verdict.LOCALIZED, confidence, f"{evidence.inliers} keypoints agree")
