@@ -20,6 +20,7 @@ COLOUR_ONLY = (SIFT_REFERENCE, COLMAP)
 
 # As the papers accept a pose: enough inliers, nothing else is asked.
 _COUNT_ONLY = VerdictOptions(
+    localized_confidence=0.0,
     localized_inliers=12,
     many_first_inliers=12,
     ambiguous_inliers=12,
