@@ -97,6 +97,7 @@ def judge(evidence: Evidence | None, options: VerdictOptions) -> Judgement:
     # like with like: nothing that a pose has guided, and one keyframe, since of a place elsewhere one was asked
     if evidence.rival > options.rival_share * evidence.first_of_best:
         doubts.append(f"a pose elsewhere has {evidence.rival} against {evidence.first_of_best} inliers")
+        confidence = min(confidence, 0.5)  # two places are alike: it is one of them
     if confidence < options.localized_confidence:
         doubts.append(f"all evidence together makes it {confidence:.0%} likely to be right")
     if doubts:
