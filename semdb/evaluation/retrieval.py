@@ -44,14 +44,22 @@ class Retrieval:
 
 def near_keyframes(pose: FloatArray, poses: FloatArray) -> BoolArray:
     """Which of `poses` ``[n, 4, 4]`` are within 0.3 m and 20 degrees of `pose`."""
-    errors = np.array([pose_error(other, pose) for other in poses]).reshape(-1, 2)
+    return _near(_errors(pose, poses))
+
+
+def _errors(pose: FloatArray, poses: FloatArray) -> FloatArray:
+    """Metres and degrees ``[n, 2]`` from `pose` to `poses` ``[n, 4, 4]``."""
+    return np.array([pose_error(other, pose) for other in poses]).reshape(-1, 2)
+
+
+def _near(errors: FloatArray) -> BoolArray:
     return np.asarray((errors[:, 0] <= NEAR_TRANSLATION_M) & (errors[:, 1] <= NEAR_ROTATION_DEG))
 
 
 def reach(pose: FloatArray, poses: FloatArray, order: Sequence[int] | None) -> Reach:
     """`order` are positions in `poses` ``[n, 4, 4]``, the best first; None where a method does not retrieve."""
-    errors = np.array([pose_error(other, pose) for other in poses]).reshape(-1, 2)
-    near = (errors[:, 0] <= NEAR_TRANSLATION_M) & (errors[:, 1] <= NEAR_ROTATION_DEG)
+    errors = _errors(pose, poses)
+    near = _near(errors)
     nearest = int(np.argmin(errors[:, 0] / NEAR_TRANSLATION_M + errors[:, 1] / NEAR_ROTATION_DEG))
     rank = None
     if order is not None:
