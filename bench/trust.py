@@ -18,6 +18,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from bench.trust_fit import fitted
 from bench.trust_rows import Row, load_rows, make_row, report, save_plots, save_rows
 from bench.trust_suites import FIT, TEST, Query, Say, World, recorded_world, rendered_world
@@ -45,8 +47,8 @@ def main() -> None:
     parser.add_argument("--work", type=Path, help="rendered rooms are kept here and found again")
     parser.add_argument("--again", type=Path, action="append", help="a file of --json to judge again")
     parser.add_argument("--fit", choices=(FIT, TEST), help="print the confidence's weights fitted on this half")
-    parser.add_argument("--every", type=int, default=1, help="ask only every n-th image,")
-    parser.add_argument("--first", type=int, default=0, help="from this one on")
+    parser.add_argument("--every", type=int, default=1, help="ask a part of the images, chosen by lot: one in n,")
+    parser.add_argument("--first", type=int, default=0, help="and which of the n parts (0 to n - 1)")
     arguments = parser.parse_args()
     if not (arguments.recordings or arguments.synthetic or arguments.again):
         parser.error("name recordings, or --synthetic, or a file with --again")
@@ -92,14 +94,16 @@ def ask_world(world: World, settings: Settings, every: int, first: int, say: Say
     with evaluation_store(settings.database_url) as store:
         localizers = _make_maps(world, store, describer, say)
         half = {plan.name: plan.half for plan in world.maps}
-        started, asked = time.perf_counter(), 0
-        for number, query in enumerate(world.queries()):
-            if number % every != first:
+        started, asked, said = time.perf_counter(), 0, 0
+        part = np.random.default_rng(0)  # in turn, with `every`, would favour what comes in turn
+        for query in world.queries():
+            if part.integers(every) != first:
                 continue
             for row in _ask(world.name, query, describer, localizers, half):
                 asked += 1
                 yield row
-            if number // every % 50 == 0:
+            if asked // 50 > said:
+                said = asked // 50
                 say(f"{world.name}: {asked} queries asked, {time.perf_counter() - started:.0f} s")
 
 
@@ -117,7 +121,7 @@ def _make_maps(world: World, store: Store, describer: Describer, say: Say) -> di
 def _ask(
     world_name: str, query: Query, describer: Describer, localizers: dict[str, Localizer], half: dict[str, str]
 ) -> Iterator[Row]:
-    picture = query.picture
+    picture = query.picture()
     description = describer.describe(picture.image, None, picture.camera, picture.instances)
     for asked in query.asked:
         found = localizers[asked.map_name].localize(description)

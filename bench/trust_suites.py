@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from bench.trust_images import SPOILED, Picture, close_up, no_place
+from bench.trust_images import SPOILED, Picture, Rng, close_up, no_place
 from semdb.keyframes import select_keyframes
 from semdb.recordings import open_recordings
 from semdb.recordings.base import FrameEntry, Recording
@@ -65,10 +66,10 @@ class Asked:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Query:
-    """An image and who is asked about it. `world_from_camera` is true in the maps that know the place."""
+    """An image, made when asked for, and who is asked about it. `world_from_camera` is true where the map knows it."""
 
     name: str
-    picture: Picture
+    picture: Callable[[], Picture]
     world_from_camera: FloatArray | None
     asked: tuple[Asked, ...]
 
@@ -243,7 +244,7 @@ def rendered_world(work: Path, say: Say, size: RenderedSize | None = None) -> Wo
 def _nothing(camera: Camera, seed: int, asked: tuple[Asked, ...], with_masks: bool) -> Iterator[Query]:
     masks = InstanceMasks(np.zeros((camera.height, camera.width), np.uint16), {}) if with_masks else None
     for number, image in enumerate(no_place(camera, seed)):
-        yield Query(f"nothing{seed}/{number}", Picture(image, camera, masks), None, asked)
+        yield Query(f"nothing{seed}/{number}", partial(Picture, image, camera, masks), None, asked)
 
 
 def _queries_of_room(scene: _Scene, others: Sequence[_Scene]) -> Iterator[Query]:
@@ -276,19 +277,22 @@ def _own(map_name: str, common: float) -> tuple[Asked, ...]:
 
 
 def _query(name: str, recording: Recording, entry: FrameEntry, asked: tuple[Asked, ...]) -> Query:
-    return Query(f"{name}/{entry.index}", _picture(recording, entry), entry.world_from_camera, asked)
+    return Query(f"{name}/{entry.index}", partial(_picture, recording, entry), entry.world_from_camera, asked)
 
 
 def _spoiled(name: str, recording: Recording, entry: FrameEntry, own: str, other: str | None) -> Iterator[Query]:
     """One frame spoiled in every way: hard for its own map, negative for another."""
-    picture = _picture(recording, entry)
     for cause, ways in SPOILED.items():
         for level, spoil in enumerate(ways, start=1):
-            spoiled = spoil(picture, np.random.default_rng([entry.index, level]))
             asked: tuple[Asked, ...] = (Asked(own, f"{cause} {level}", HARD),)
             if other is not None:
                 asked += (Asked(other, f"other room, {cause}", NEGATIVE),)
-            yield Query(f"{name}/{entry.index}/{cause}{level}", spoiled, entry.world_from_camera, asked)
+            picture = partial(_spoil, recording, entry, spoil, level)
+            yield Query(f"{name}/{entry.index}/{cause}{level}", picture, entry.world_from_camera, asked)
+
+
+def _spoil(recording: Recording, entry: FrameEntry, spoil: Callable[[Picture, Rng], Picture], level: int) -> Picture:
+    return spoil(_picture(recording, entry), np.random.default_rng([entry.index, level]))
 
 
 def _queries_of_office(scene: _Scene, others: Sequence[_Scene]) -> Iterator[Query]:
@@ -304,7 +308,7 @@ def _queries_of_office(scene: _Scene, others: Sequence[_Scene]) -> Iterator[Quer
             if count > 400 and picture.instances.categories.get(int(label)) in ("tv", "laptop")
         ]
         for label in screens[:1]:
-            near = close_up(picture, label)
+            near = partial(close_up, picture, label)
             asked = (Asked(scene.name, "equal desks, close up", HARD),)
             yield Query(f"{scene.name}/{entry.index}/close", near, entry.world_from_camera, asked)
 
