@@ -1,9 +1,9 @@
-"""Mask R-CNN in torchvision: its architectures, and which one a checkpoint is of."""
+"""Mask R-CNN in torchvision: its architectures, which one a checkpoint is of, and how it is run."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,7 +65,8 @@ def build(architecture: Architecture, classes: int, *, frozen: bool = True) -> A
     if architecture.version == 2:
         if architecture.backbone != "resnet50":
             raise ModelError(f"{architecture.name}: version 2 of Mask R-CNN is known with resnet50 only")
-        return maskrcnn_resnet50_fpn_v2(weights=None, weights_backbone=None, num_classes=classes, **sizes)
+        network = maskrcnn_resnet50_fpn_v2(weights=None, weights_backbone=None, num_classes=classes, **sizes)
+        return _keep_boxes_exact(network)
     norm = FrozenBatchNorm2d if frozen else BatchNorm2d
     width = architecture.channels
     body = getattr(torchvision.models, architecture.backbone)(weights=None, norm_layer=norm)
@@ -86,7 +87,61 @@ def build(architecture: Architecture, classes: int, *, frozen: bool = True) -> A
     for module in network.modules():
         if isinstance(module, FrozenBatchNorm2d):
             module.eps = architecture.epsilon
+    return _keep_boxes_exact(network)
+
+
+def _keep_boxes_exact(network: Any) -> Any:
+    """`network` with anchors, boxes and scores in float32 under autocast too.
+
+    torchvision computes boxes in the precision of what its layers give: half precision has steps of a whole pixel from
+    1024 on. Layers run in the precision of the context; what they hand on is float32 again.
+    """
+    heads = network.roi_heads
+    for module in (network.backbone, network.rpn.head, heads.box_predictor, heads.mask_predictor):
+        module.register_forward_hook(lambda _, __, result: _as_float32(result))
     return network
+
+
+def _as_float32(result: Any) -> Any:
+    if isinstance(result, Mapping):
+        return {name: _as_float32(value) for name, value in result.items()}
+    if isinstance(result, (tuple, list)):
+        return type(result)(_as_float32(value) for value in result)
+    return result.float()
+
+
+def infer(network: Any, images: Sequence[Any], mask_above: float) -> list[dict[str, Any]]:
+    """What `network` finds in each of `images`, tensors ``[3, H, W]`` of one size, float32 RGB 0..1, on its device.
+
+    ``boxes``, ``labels`` and ``scores`` as torchvision gives them, by descending score; ``masks`` ``[M, 1, H, W]``
+    of the first M alone, whose score is at least `mask_above`: the mask head is a third of the work when it sees a
+    hundred boxes, most of which are too weak to be objects.
+    """
+    import torch
+    from torchvision.models.detection.roi_heads import maskrcnn_inference
+    from torchvision.models.detection.transform import resize_boxes
+
+    heads, size = network.roi_heads, tuple(images[0].shape[-2:])
+    batch, _ = network.transform(list(images))
+    features = network.backbone(batch.tensors)
+    proposals, _ = network.rpn(batch, features)
+    regions = heads.box_head(heads.box_roi_pool(features, proposals, batch.image_sizes))
+    found = heads.postprocess_detections(*heads.box_predictor(regions), proposals, batch.image_sizes)
+    results = [
+        {"boxes": resize_boxes(boxes, inside, size), "labels": labels, "scores": scores}
+        for boxes, scores, labels, inside in zip(*found, batch.image_sizes, strict=True)
+    ]
+    counts = [int((scores >= mask_above).sum()) for scores in found[1]]  # scores descend
+    strong = [{"boxes": b[:n], "labels": k[:n]} for b, k, n in zip(found[0], found[2], counts, strict=True)]
+    if sum(counts):
+        pooled = heads.mask_roi_pool(features, [one["boxes"] for one in strong], batch.image_sizes)
+        logits = heads.mask_predictor(heads.mask_head(pooled))
+        for one, masks in zip(strong, maskrcnn_inference(logits, [one["labels"] for one in strong]), strict=True):
+            one["masks"] = masks
+        network.transform.postprocess(strong, batch.image_sizes, [size] * len(strong))
+    for result, one in zip(results, strong, strict=True):
+        result["masks"] = one.get("masks", torch.zeros((0, 1, *size), device=result["boxes"].device))
+    return results
 
 
 def recognise(tensors: Mapping[str, Any], path: Path) -> tuple[Architecture, int]:

@@ -9,6 +9,9 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
 from semdb.errors import ModelError, UsageError
 from semdb.perception.catalogue import BY_NAME
 from semdb.perception.model_files import first_line, models_dir, resolve_file
@@ -71,6 +74,12 @@ def prepare(module: Any, settings: Settings, torch: Any) -> Any:
     """`module` for inference on the device of `settings`; sets the number of CPU threads of the process."""
     torch.set_num_threads(settings.threads)
     return module.eval().requires_grad_(False).to(choose_device(settings.device, torch))
+
+
+def to_device(array: npt.NDArray[np.generic], device: Any, torch: Any) -> Any:
+    """`array` as a tensor on `device`; to CUDA from pinned memory, so that the transfer runs beside other work."""
+    tensor = torch.from_numpy(np.ascontiguousarray(array))
+    return tensor.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else tensor.to(device)
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

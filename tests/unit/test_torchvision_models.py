@@ -178,6 +178,53 @@ def test_half_precision_gives_nearly_the_same(tmp_path: Path, monkeypatch: pytes
     assert half[0].box.dtype == np.float32
 
 
+def test_boxes_are_exact_in_half_precision(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Layers run in bfloat16, whose numbers from 64 on are half a pixel apart; anchors, regions and boxes do not."""
+    seen: list[Any] = []
+    detector = load_light(trained(tmp_path / "cups.pth"))
+    network = detector._network
+    network.rpn.anchor_generator.register_forward_hook(lambda m, i, anchors: seen.extend(anchors))
+    network.rpn.register_forward_hook(lambda m, i, result: seen.extend(result[0]))
+    network.backbone.fpn.layer_blocks[0].register_forward_hook(lambda m, i, result: seen.append(result))
+    monkeypatch.setattr(
+        detectors, "inference_precision", lambda device, torch: torch.autocast("cpu", dtype=torch.bfloat16)
+    )
+    found = detector.detect(picture(8), None)
+    assert [tensor.dtype for tensor in seen] == [torch.bfloat16, torch.float32, torch.float32]
+    boxes = torch.from_numpy(np.array([d.box for d in found]))
+    assert (boxes != boxes.bfloat16().float()).float().mean() > 0.5
+
+
+def test_weak_detections_cost_no_mask(tmp_path: Path) -> None:
+    """What is found is what torchvision finds; masks are computed for those that are stored as objects alone."""
+    spec, image = trained(tmp_path / "cups.pth"), picture(2)
+    every = load_light(spec, threshold=0.05).detect(image, None)
+    threshold = (every[1].score + every[2].score) / 2
+    detector = load_light(spec, threshold=threshold)
+    masks: list[int] = []
+    detector._network.roi_heads.mask_head.register_forward_hook(lambda m, i, result: masks.append(len(result)))
+    found = detector.detect(image, None)
+    assert masks == [2]
+    assert [d.weak for d in found] == [False, False, *(True for _ in every[2:])]
+    assert [d.score for d in found] == pytest.approx([d.score for d in every])
+    assert all(np.array_equal(a.mask, b.mask) for a, b in zip(found[:2], every, strict=False))
+    with torch.inference_mode():
+        (expected,) = detector._network([detectors.image_tensor(image, torch)])
+    np.testing.assert_allclose([d.score for d in found], expected["scores"], atol=1e-6)
+    none = load_light(spec, threshold=1.0).detect(image, None)
+    assert len(none) == len(every)
+    assert all(d.weak and d.mask.size == 0 for d in none)
+
+
+def test_images_go_to_the_device_as_bytes() -> None:
+    images = [picture(seed) for seed in (1, 2, 3)]
+    found = detectors.image_tensors(images, torch.device("cpu"), torch)
+    assert len(found) == 3
+    for image, tensor in zip(images, found, strict=True):
+        assert tensor.is_contiguous()
+        assert torch.equal(tensor, detectors.image_tensor(image, torch))
+
+
 def test_places365_features_are_those_before_the_last_layer(tmp_path: Path) -> None:
     (tmp_path / "models").mkdir()
     network = write_places365(tmp_path / "models" / "resnet50_places365.pth.tar")

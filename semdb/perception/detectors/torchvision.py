@@ -6,14 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from semdb.errors import ModelError
 from semdb.perception import mask_rcnn
 from semdb.perception.catalogue import BY_NAME
 from semdb.perception.detectors.coco import COCO_91, NO_OBJECT
-from semdb.perception.detectors.onnx import MASK_THRESHOLD, NO_MASK, WEAK_THRESHOLD
+from semdb.perception.detectors.onnx import MASK_THRESHOLD, NO_MASK, WEAK_THRESHOLD, image_to_batch
 from semdb.perception.mask_rcnn import Architecture
 from semdb.perception.model_files import canonical_json, file_sha256, first_line
 from semdb.perception.torch_models import (
@@ -23,6 +22,7 @@ from semdb.perception.torch_models import (
     read_checkpoint,
     resolve_checkpoint,
     state_dict_of,
+    to_device,
 )
 from semdb.settings import Settings
 from semdb.types import Detection, Float32Array, ImageArray, InstanceMasks, ModelInfo
@@ -90,7 +90,7 @@ class TorchvisionDetector:
         torch = self._torch
         try:
             with torch.inference_mode(), inference_precision(self._device, torch):
-                return list(self._network([image_tensor(image, torch).to(self._device) for image in images]))
+                return mask_rcnn.infer(self._network, image_tensors(images, self._device, torch), self._score_threshold)
         except RuntimeError as error:  # torch's errors, out of memory among them
             what = f"{len(images)} images of {images[0].shape[1]}x{images[0].shape[0]}"
             raise ModelError(f"{self._path} failed on {what} on {self._device}: {first_line(error)}") from error
@@ -107,9 +107,9 @@ class TorchvisionDetector:
         for k in np.argsort(-scores, kind="stable"):
             category = self.classes[int(labels[k])]
             weak = bool(scores[k] < self._score_threshold)
-            if category not in NO_OBJECT and (weak or masks[k].any()):
+            mask = NO_MASK if weak else masks[k].copy()
+            if category not in NO_OBJECT and (weak or mask.any()):
                 box: Float32Array = np.clip(boxes[k], 0, limits).astype(np.float32)
-                mask = NO_MASK if weak else masks[k].copy()
                 found.append(Detection(category, float(scores[k]), box, mask, weak))
         return tuple(found)
 
@@ -148,10 +148,16 @@ def known_architecture(spec: str) -> Architecture | None:
 
 def image_tensor(image: ImageArray, torch: Any) -> Any:
     """`image` ``[H, W, 3]`` as a float32 tensor ``[3, H, W]`` from 0 to 1."""
-    planes = np.empty((3, *image.shape[:2]), dtype=np.float32)
-    for channel, plane in enumerate(cv2.split(image)):
-        np.multiply(plane, np.float32(1 / 255), out=planes[channel])
-    return torch.from_numpy(planes)
+    return torch.from_numpy(image_to_batch(image)[0])
+
+
+def image_tensors(images: Sequence[ImageArray], device: Any, torch: Any) -> list[Any]:
+    """`images` of one size as `image_tensor` gives them, on `device`.
+
+    They go there as bytes, a quarter of the size, in one transfer; the device makes the floats.
+    """
+    batch = to_device(np.stack(images), device, torch).permute(0, 3, 1, 2)
+    return list(batch.to(torch.float32, memory_format=torch.contiguous_format).mul_(1 / 255))
 
 
 def _name_of(spec: str) -> str:

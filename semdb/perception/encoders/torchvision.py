@@ -21,6 +21,7 @@ from semdb.perception.torch_models import (
     read_checkpoint,
     resolve_checkpoint,
     state_dict_of,
+    to_device,
 )
 from semdb.settings import Settings
 from semdb.types import Float32Array, ImageArray, ModelInfo
@@ -61,7 +62,7 @@ class TorchvisionEncoder:
     def encode_batch(self, images: Sequence[ImageArray]) -> Float32Array:
         """The vectors of `images` (of any sizes) float32 ``[n, d]``; each as `encode` gives it, within rounding."""
         torch = self._torch
-        batch = torch.from_numpy(np.concatenate([centre_batch(image) for image in images])).to(self._device)
+        batch = to_device(np.concatenate([centre_batch(image) for image in images]), self._device, torch)
         try:
             with torch.inference_mode(), inference_precision(self._device, torch):
                 found = self._network(batch).float().cpu().numpy()
