@@ -26,7 +26,15 @@ from semdb.localization.coarse import (
 from semdb.localization.confidence import Evidence, gather_evidence
 from semdb.localization.keyframe_cache import KeyframeCache
 from semdb.localization.matching import Matches
-from semdb.localization.pose import PoseEstimate, PoseOptions, estimate_pose, match_view, rival_pose
+from semdb.localization.pose import (
+    FirstPose,
+    PoseEstimate,
+    PoseOptions,
+    estimate_pose,
+    first_pose,
+    match_view,
+    rival_pose,
+)
 from semdb.localization.verdict import Judgement, VerdictOptions, convinces, judge
 from semdb.localization.views import KeyframeView, View, make_view
 from semdb.types import Candidate, Description, Float32Array, Localization, ModelInfo, Verdict
@@ -55,6 +63,7 @@ class _Search:
     keyframes: list[KeyframeView] = field(default_factory=list)
     matches: list[Matches] = field(default_factory=list)
     proposals: list[Proposal] = field(default_factory=list)
+    first: FirstPose | None = None
     estimate: PoseEstimate | None = None
     following: tuple[Proposal, ...] = ()
     stage: str = Stage.FILTERED
@@ -95,7 +104,7 @@ class Localizer:
         for batch in cascade(source, self._classes(description), description.cnn_vector, self.options.coarse):
             search.timing_ms["rank"] += _ms_since(started)
             self._try(search, batch)
-            if convinces(search.estimate, self.options.verdict):
+            if convinces(search.first, self.options.verdict):
                 break
             started = time.perf_counter()
         search.timing_ms["filter"] = source.filter_ms
@@ -143,7 +152,9 @@ class Localizer:
         search.proposals += batch.proposals
         search.following = batch.following
         self._match(search, [proposal.keyframe_id for proposal in batch.proposals])
-        self._estimate(search)
+        started = time.perf_counter()
+        search.first = first_pose(search.query, search.keyframes, search.matches, self.options.pose)
+        search.timing_ms["pose"] += _ms_since(started)
 
     def _match(self, search: _Search, keyframe_ids: Sequence[int]) -> None:
         started = time.perf_counter()
@@ -152,14 +163,12 @@ class Localizer:
             search.matches.append(match_view(search.query, keyframe, self.options.pose.matching))
         search.timing_ms["match"] += _ms_since(started)
 
-    def _estimate(self, search: _Search) -> None:
-        started = time.perf_counter()
-        search.estimate = estimate_pose(search.query, search.keyframes, search.matches, self.options.pose)
-        search.timing_ms["pose"] += _ms_since(started)
-
     def _conclude(self, search: _Search) -> Localization:
-        if convinces(search.estimate, self.options.verdict) and search.stage != Stage.GIVEN:
+        convinced = convinces(search.first, self.options.verdict) and search.stage != Stage.GIVEN
+        if convinced:
             self._ask_neighbours(search)
+        self._estimate(search)
+        if convinced:
             self._ask_twins(search)
         started = time.perf_counter()
         rival = 0
@@ -172,18 +181,29 @@ class Localizer:
 
     def _ask_neighbours(self, search: _Search) -> None:
         """Keyframes near the first pose see the same things from elsewhere: their pairs steady the pose."""
-        if search.estimate is None or self.options.neighbours == 0:
+        if search.first is None or self.options.neighbours == 0:
             return
         matched = {keyframe.keyframe_id for keyframe in search.keyframes}
-        chosen = self.cache.near(search.estimate.world_from_camera, FAR, matched)[: self.options.neighbours]
-        if not chosen:
+        chosen = self.cache.near(search.first.world_from_camera, FAR, matched)[: self.options.neighbours]
+        if chosen:
+            search.proposals += [Proposal(i, float("nan"), float("nan")) for i in chosen]
+            self._match(search, chosen)
+
+    def _estimate(self, search: _Search) -> None:
+        """The last pose, of all that was matched; without the neighbours where these take support away."""
+        if search.first is None:
             return
-        before = search.estimate
-        search.proposals += [Proposal(i, float("nan"), float("nan")) for i in chosen]
-        self._match(search, chosen)
-        self._estimate(search)
-        if search.estimate is None or search.estimate.inliers < before.inliers:
-            search.estimate = before
+        started = time.perf_counter()
+        counts = dict.fromkeys((len(search.keyframes), search.first.keyframes))
+        for count in counts:
+            found = estimate_pose(
+                search.query, search.keyframes[:count], search.matches[:count], self.options.pose, search.first
+            )
+            if search.estimate is None or (found is not None and found.inliers > search.estimate.inliers):
+                search.estimate = found
+            if search.estimate is not None and search.estimate.inliers >= search.first.inliers:
+                break
+        search.timing_ms["pose"] += _ms_since(started)
 
     def _ask_twins(self, search: _Search) -> None:
         """A keyframe far from the pose that looks as much like the query may show a place that is the same twice.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import poselib
@@ -49,6 +50,38 @@ class Pairs:
 
     def take(self, keep: BoolArray | IntArray) -> Pairs:
         return Pairs(self.query[keep], self.slot[keep], self.keypoint[keep], self.same_class[keep])
+
+
+@dataclass(frozen=True, slots=True)
+class FirstSupport:
+    """Pairs that agree on a pose before any was guided: `inliers` distinct keypoints of the query, `of_best` pairs."""
+
+    inliers: int  # of all keyframes
+    of_best: int  # with the keyframe that has most of them
+    agreement: float  # their share of the pairs with that keyframe
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FirstPose:
+    """A pose found in a few milliseconds: enough to decide whether more keyframes are to be matched.
+
+    `inliers` (distinct keypoints of the query, guided) and `spread` are as in `PoseEstimate`, of a pose that nothing
+    refined: those of a turning camera are fewer than in the end.
+    """
+
+    camera_from_world: FloatArray
+    keyframes: int  # how many were matched
+    first: FirstSupport
+    inliers: int
+    spread: float
+
+    @property
+    def world_from_camera(self) -> FloatArray:
+        return invert_pose(self.camera_from_world)
+
+    @property
+    def first_inliers(self) -> int:
+        return self.first.inliers
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,21 +152,14 @@ def robust_pnp(
     """LO-RANSAC over all pairs (PoseLib): ``camera_from_world`` and which pairs agree; None where none is found."""
     if len(pairs) < MINIMUM_PAIRS:
         return None
-    focal = query.focal
-    pixels = query.xy[pairs.query] * focal
-    camera = {
-        "model": "SIMPLE_PINHOLE",
-        "width": query.camera.width,
-        "height": query.camera.height,
-        "params": [focal, 0, 0],
-    }
+    pixels = query.xy[pairs.query] * query.focal
     ransac = {
         "max_reproj_error": options.max_reprojection_px,
         "min_iterations": min(200, max_iterations),
         "max_iterations": max_iterations,
         "seed": 0,
     }
-    pose, report = poselib.estimate_absolute_pose(pixels, points, camera, ransac, {"loss_type": "CAUCHY"})
+    pose, report = poselib.estimate_absolute_pose(pixels, points, _pinhole(query), ransac, {"loss_type": "CAUCHY"})
     inliers = np.asarray(report["inliers"], np.bool_)
     if inliers.sum() < MINIMUM_PAIRS:
         return None
@@ -142,6 +168,12 @@ def robust_pnp(
     if not np.isfinite(camera_from_world).all():
         return None
     return camera_from_world, inliers
+
+
+def _pinhole(query: View) -> dict[str, Any]:
+    """The camera of pixels that are undistorted and counted from the centre, as PoseLib wants it."""
+    width, height = query.camera.width, query.camera.height
+    return {"model": "SIMPLE_PINHOLE", "width": width, "height": height, "params": [query.focal, 0, 0]}
 
 
 def guided_pairs(
@@ -166,10 +198,10 @@ def guided_pairs(
     )
 
 
-def estimate_pose(
+def first_pose(
     query: View, keyframes: Sequence[KeyframeView], matches: Sequence[Matches], options: PoseOptions
-) -> PoseEstimate | None:
-    """The pose that the pairs with all `keyframes` agree on, or None.
+) -> FirstPose | None:
+    """The pose that most pairs with all `keyframes` agree on, not refined, or None.
 
     `matches` are those of `match_view`, one per keyframe.
     """
@@ -181,11 +213,41 @@ def estimate_pose(
     camera_from_world, agreeing = found
     first = _first_support(pairs, agreeing)
     if options.guided:
-        pairs = guided_pairs(query, keyframes, _project(query, keyframes, camera_from_world), options.matching)
-        points = world_points_of(pairs, keyframes)
-        agreeing = reprojection_px(query, camera_from_world, pairs.query, points) < options.max_reprojection_px
-        if agreeing.sum() < MINIMUM_PAIRS:
+        pairs, points = _guided_by_pose(query, keyframes, camera_from_world, options)
+    error = reprojection_px(query, camera_from_world, pairs.query, points)
+    rows = pairs.query[error < options.inlier_px]
+    return FirstPose(camera_from_world, len(keyframes), first, len(np.unique(rows)), image_spread(query, rows))
+
+
+def estimate_pose(
+    query: View,
+    keyframes: Sequence[KeyframeView],
+    matches: Sequence[Matches],
+    options: PoseOptions,
+    start: FirstPose | None = None,
+) -> PoseEstimate | None:
+    """The pose that the pairs with all `keyframes` agree on, or None.
+
+    `matches` are those of `match_view`, one per keyframe. With `start`, which `first_pose` found with the first of
+    them, no other pose is looked for.
+    """
+    pairs = join_pairs(matches)
+    points = world_points_of(pairs, keyframes)
+    if start is None:
+        start = first_pose(query, keyframes, matches, options)
+        if start is None:
             return None
+    camera_from_world, first = start.camera_from_world, start.first
+    if start.keyframes < len(keyframes):
+        camera_from_world = _joined_pose(query, pairs, points, camera_from_world, options)
+    agreeing = reprojection_px(query, camera_from_world, pairs.query, points) < options.max_reprojection_px
+    if start.keyframes < len(keyframes) and agreeing.any():
+        first = _first_support(pairs, agreeing)
+    if options.guided:
+        pairs, points = _guided_by_pose(query, keyframes, camera_from_world, options)
+        agreeing = reprojection_px(query, camera_from_world, pairs.query, points) < options.max_reprojection_px
+    if agreeing.sum() < MINIMUM_PAIRS:
+        return None
     if not options.bundle:
         pairs, points = pairs.take(agreeing), points[agreeing]
         error = reprojection_px(query, camera_from_world, pairs.query, points)
@@ -197,6 +259,34 @@ def estimate_pose(
     pose, covariance = refined.camera_from_world, refined.covariance
     estimate = _estimate(query, keyframes, pairs, error, pose, covariance, first, options)
     return None if estimate is None else replace(estimate, aligned=aligned)
+
+
+def _joined_pose(
+    query: View, pairs: Pairs, points: FloatArray, camera_from_world: FloatArray, options: PoseOptions
+) -> FloatArray:
+    """The pose fitted also to the pairs with keyframes that joined later, unless fewer pairs agree on it then."""
+    error = reprojection_px(query, camera_from_world, pairs.query, points)
+    near = error < 2 * options.max_reprojection_px
+    if near.sum() < MINIMUM_PAIRS:
+        return camera_from_world
+    start = poselib.CameraPose()
+    start.R, start.t = camera_from_world[:3, :3], camera_from_world[:3, 3]
+    pixels = query.xy[pairs.query[near]] * query.focal
+    loss = {"loss_type": "CAUCHY", "loss_scale": options.pixel_sigma_px}
+    pose, _ = poselib.refine_absolute_pose(pixels, points[near], start, _pinhole(query), loss)
+    fitted = np.eye(4)
+    fitted[:3] = pose.Rt
+    agreeing = reprojection_px(query, fitted, pairs.query, points) < options.max_reprojection_px
+    better = np.isfinite(fitted).all() and agreeing.sum() >= (error < options.max_reprojection_px).sum()
+    return fitted if better else camera_from_world
+
+
+def _guided_by_pose(
+    query: View, keyframes: Sequence[KeyframeView], camera_from_world: FloatArray, options: PoseOptions
+) -> tuple[Pairs, FloatArray]:
+    """Pairs near where a pose alone projects the keyframes' points, and their points ``[n, 3]``."""
+    pairs = guided_pairs(query, keyframes, _project(query, keyframes, camera_from_world), options.matching)
+    return pairs, world_points_of(pairs, keyframes)
 
 
 def _refine(
@@ -239,12 +329,11 @@ def _project(query: View, keyframes: Sequence[KeyframeView], camera_from_world: 
     ]
 
 
-def _first_support(pairs: Pairs, agreeing: BoolArray) -> tuple[int, int, float]:
-    """Pairs that agree before any is guided: of all keyframes, of the best one, and the share of that one's pairs."""
+def _first_support(pairs: Pairs, agreeing: BoolArray) -> FirstSupport:
     counts = np.bincount(pairs.slot[agreeing])
     best = int(counts.argmax())
     tried = np.count_nonzero(pairs.slot == best)
-    return len(np.unique(pairs.query[agreeing])), int(counts[best]), float(counts[best] / tried)
+    return FirstSupport(len(np.unique(pairs.query[agreeing])), int(counts[best]), float(counts[best] / tried))
 
 
 def rival_pose(
@@ -279,7 +368,7 @@ def _estimate(
     error: FloatArray,
     camera_from_world: FloatArray,
     covariance: FloatArray | None,
-    first: tuple[int, int, float],
+    first: FirstSupport,
     options: PoseOptions,
 ) -> PoseEstimate | None:
     keep = error < options.inlier_px
@@ -293,9 +382,9 @@ def _estimate(
         pairs=inliers,
         inliers=len(np.unique(inliers.query)),
         per_keyframe=tuple(int((inliers.slot == slot).sum()) for slot in range(len(keyframes))),
-        first_inliers=first[0],
-        first_of_best=first[1],
-        agreement=first[2],
+        first_inliers=first.inliers,
+        first_of_best=first.of_best,
+        agreement=first.agreement,
         residual_px=residual_px,
         spread=image_spread(query, inliers.query),
     )

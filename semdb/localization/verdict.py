@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from semdb.localization.confidence import Evidence, confidence_of
-from semdb.localization.pose import PoseEstimate
+from semdb.localization.pose import FirstPose, PoseEstimate
 from semdb.types import Verdict
 
 
@@ -48,7 +48,7 @@ class Judgement:
     reason: str
 
 
-def convinces(estimate: PoseEstimate | None, options: VerdictOptions) -> bool:
+def convinces(estimate: PoseEstimate | FirstPose | None, options: VerdictOptions) -> bool:
     """Whether a pose is so well supported that no further keyframe need be asked."""
     return (
         estimate is not None
