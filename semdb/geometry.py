@@ -192,22 +192,15 @@ def pixels_to_normalized(camera: Camera, pixels: npt.ArrayLike) -> FloatArray:
     NaN where the distortion model cannot be inverted (outside the image of a strongly distorted lens).
     """
     p = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
-    target_x, target_y = (p[:, 0] - camera.cx) / camera.fx, (p[:, 1] - camera.cy) / camera.fy
+    targets = (p - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
     if not any(camera.distortion):
-        return np.stack([target_x, target_y], axis=1)
-    x, y = target_x.copy(), target_y.copy()
-    for _ in range(20):
-        xd, yd, (dxx, dxy, dyy) = _distort(camera.distortion, x, y)
-        ex, ey = xd - target_x, yd - target_y
-        if len(p) == 0 or max(np.abs(ex).max(), np.abs(ey).max()) < 1e-12:
-            break
-        with np.errstate(divide="ignore", invalid="ignore"):
-            determinant = dxx * dyy - dxy * dxy
-            x = x - (dyy * ex - dxy * ey) / determinant
-            y = y - (dxx * ey - dxy * ex) / determinant
-    xd, yd, _ = _distort(camera.distortion, x, y)
-    bad = ~(np.hypot(xd - target_x, yd - target_y) < 1e-6)
-    return np.where(bad[:, None], np.nan, np.stack([x, y], axis=1))
+        return targets
+    from semdb._undistort import undistort  # numba takes half a second to import
+
+    coefficients = (*camera.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
+    xy = np.empty_like(targets)
+    undistort(tuple(map(float, coefficients)), targets, xy)  # type: ignore[no-untyped-call]
+    return xy
 
 
 def back_project(camera: Camera, pixels: npt.ArrayLike, depth: npt.ArrayLike) -> FloatArray:

@@ -29,12 +29,9 @@ TOLERANCE = np.float32(-1e-4)  # a pixel centre on the edge of two triangles bel
 
 def register_seven_scenes(depth: Float32Array, camera: Camera) -> Float32Array:
     """Depth ``[480, 640]`` metres of the depth camera (NaN invalid) as seen by the colour `camera` ``[H, W]``."""
-    rays = _rotated_rays()
-    tx, ty, tz = (np.float32(value) for value in COLOR_FROM_DEPTH[:3, 3])
-    z = depth * rays[2] + tz
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse_z = np.float32(1) / z
-        x, y = (depth * rays[0] + tx) * inverse_z, (depth * rays[1] + ty) * inverse_z
+    x, y, inverse_z, known = (np.empty(depth.shape, dtype=np.float32) for _ in range(4))
+    shift = COLOR_FROM_DEPTH[:3, 3].astype(np.float32)
+    _transform(np.ascontiguousarray(depth, dtype=np.float32), _rotated_rays(), shift, x, y, inverse_z, known)
     if any(camera.distortion):
         pixels = normalized_to_pixels(camera, np.column_stack([x.ravel(), y.ravel()]).astype(np.float64))
         u = pixels[:, 0].reshape(depth.shape).astype(np.float32)
@@ -42,7 +39,6 @@ def register_seven_scenes(depth: Float32Array, camera: Camera) -> Float32Array:
     else:
         u = x * np.float32(camera.fx) + np.float32(camera.cx)
         v = y * np.float32(camera.fy) + np.float32(camera.cy)
-    known = np.nan_to_num(depth, nan=0.0)  # the kernel is compiled for numbers without NaN
     nearest = np.zeros((camera.height, camera.width), dtype=np.float32)  # 1/z, 0 is nothing
     _rasterise(known, u, v, inverse_z, np.float32(MAX_STEP), nearest)
     registered = np.full_like(nearest, np.nan)
@@ -58,6 +54,19 @@ def _rotated_rays() -> Float32Array:  # [3, 480, 640]
     rays = back_project(camera, np.column_stack([u.ravel(), v.ravel()]), np.ones(u.size))
     turned = (rays @ COLOR_FROM_DEPTH[:3, :3].T).T.reshape(3, camera.height, camera.width)
     return np.ascontiguousarray(turned, dtype=np.float32)
+
+
+@kernel
+def _transform(depth, rays, shift, x, y, inverse_z, known):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Where each depth pixel is in the other camera: normalised x and y, and 1/z; `known` is `depth`, 0 for NaN."""
+    for row in range(depth.shape[0]):
+        for column in range(depth.shape[1]):
+            d = depth[row, column]
+            w = np.float32(1) / (d * rays[2, row, column] + shift[2])
+            x[row, column] = (d * rays[0, row, column] + shift[0]) * w
+            y[row, column] = (d * rays[1, row, column] + shift[1]) * w
+            inverse_z[row, column] = w
+            known[row, column] = d if d > 0 else np.float32(0)
 
 
 @kernel(fastmath=True)
