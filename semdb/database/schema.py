@@ -13,7 +13,7 @@ from semdb.database.engine import safe_url
 from semdb.errors import SchemaError
 
 # Ascending; the last one is what this version of semdb reads and writes. A test compares them with the scripts.
-REVISIONS = ("0001", "0002", "0003", "0004", "0005")
+REVISIONS = ("0001", "0002", "0003", "0004", "0005", "0006")
 HEAD = REVISIONS[-1]
 
 

@@ -258,3 +258,12 @@ class_confusions = _table(
     Column("pairs", BigInteger, nullable=False),
     Column("weight", Integer, nullable=False),
 )
+
+refined_points = _table(
+    "refined_points",
+    _ref("keyframe_id", "keyframes.id", primary_key=True),
+    Column("count", Integer, nullable=False),
+    Column("fused", Integer, nullable=False),
+    Column("triangulated", Integer, nullable=False),
+    Column("data", Blob, nullable=False),
+)
