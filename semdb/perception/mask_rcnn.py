@@ -114,8 +114,8 @@ def infer(network: Any, images: Sequence[Any], mask_above: float) -> list[dict[s
     """What `network` finds in each of `images`, tensors ``[3, H, W]`` of one size, float32 RGB 0..1, on its device.
 
     ``boxes``, ``labels`` and ``scores`` as torchvision gives them, by descending score; ``masks`` ``[M, 1, H, W]``
-    of the first M alone, whose score is at least `mask_above`: the mask head is a third of the work when it sees a
-    hundred boxes, most of which are too weak to be objects.
+    of the first M alone, whose score is at least `mask_above`: the mask head is a quarter of the work on a CPU when it
+    sees a hundred boxes, most of which are too weak to be objects.
     """
     import torch
     from torchvision.models.detection.roi_heads import maskrcnn_inference

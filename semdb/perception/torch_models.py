@@ -62,8 +62,8 @@ def choose_device(name: str, torch: Any) -> Any:
     return torch.device(name)
 
 
-def inference_precision(device: Any, torch: Any) -> AbstractContextManager[Any]:
-    """Half precision on CUDA (convolutions and products; box arithmetic stays float32), float32 elsewhere."""
+def layer_precision(device: Any, torch: Any) -> AbstractContextManager[Any]:
+    """The precision of convolutions and products: half on CUDA, float32 elsewhere. Boxes and losses are float32."""
     if device.type == "cuda":
         context: AbstractContextManager[Any] = torch.autocast("cuda", dtype=torch.float16)
         return context

@@ -6,7 +6,6 @@ import csv
 import math
 import time
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from typing import Any
 from semdb.errors import TrainingError, UsageError
 from semdb.perception.detectors.torchvision import FORMAT
 from semdb.perception.mask_rcnn import Architecture
-from semdb.perception.torch_models import choose_device, import_torch, read_checkpoint
+from semdb.perception.torch_models import choose_device, import_torch, layer_precision, read_checkpoint
 from semdb.settings import Settings
 from semdb.training.coco import CocoData, load_coco
 from semdb.training.options import TrainOptions
@@ -77,13 +76,18 @@ def train(
     device = choose_device(settings.device, torch)
     network, architecture = first_network(options, data.classes, settings)
     run = _Run(options, data, network.to(device), architecture, device, torch)
-    network.roi_heads.fg_bg_sampler.batch_size_per_image = options.rois
-    proposals = network.rpn._post_nms_top_n
-    proposals["training"] = min(proposals["training"], 4 * options.rois)
+    _limit_regions(network, options.rois)
     state = _read_state(path, run) if resume else None
     with _Curves(options.output / CURVES, run.step) as curves:
         _run_stages(run, state, curves, progress, stop_after)
     return Trained(path, options.output / CURVES, run.step, tuple(run.losses))
+
+
+def _limit_regions(network: Any, rois: int) -> None:
+    """The heads learn from `rois` regions of an image, drawn from 4 times as many, those from the best 16 times."""
+    network.roi_heads.fg_bg_sampler.batch_size_per_image = rois
+    for limits, most in ((network.rpn._post_nms_top_n, 4 * rois), (network.rpn._pre_nms_top_n, 16 * rois)):
+        limits["training"] = min(limits["training"], most)
 
 
 def _run_stages(
@@ -140,12 +144,12 @@ def _learn(run: _Run, group: Sequence[Sample], optimizer: Any, scaler: Any, rate
     torch = run.torch
     for parameters in optimizer.param_groups:
         parameters["lr"] = rate
-    images = [image.to(run.device) for image, _ in group]
-    targets = [{name: value.to(run.device) for name, value in target.items()} for _, target in group]
-    with _precision(run):
+    images = [_on_device(image, run) for image, _ in group]
+    targets = [{name: _on_device(value, run) for name, value in target.items()} for _, target in group]
+    with layer_precision(run.device, torch):
         losses = run.network(images, targets)
         loss = sum(losses.values())
-    value = float(loss.detach())
+    value, *parts = torch.stack([loss.detach(), *(losses[name].detach() for name in LOSSES)]).tolist()
     if not math.isfinite(value):
         raise TrainingError(
             f"the loss is {value} at step {run.step + 1}: the learning rate ({rate:g}) is too high, or the data have "
@@ -159,27 +163,26 @@ def _learn(run: _Run, group: Sequence[Sample], optimizer: Any, scaler: Any, rate
     scaler.step(optimizer)
     scaler.update()
     run.losses.append(value)
-    return {"loss": value, **{name: float(losses[name].detach()) for name in LOSSES}}
+    return {"loss": value, **dict(zip(LOSSES, parts, strict=True))}
+
+
+def _on_device(tensor: Any, run: _Run) -> Any:
+    return tensor.pin_memory().to(run.device, non_blocking=True) if run.device.type == "cuda" else tensor.to(run.device)
 
 
 def _optimizer(run: _Run, stage: Stage) -> Any:
     learning = [p for p in run.network.parameters() if p.requires_grad]
+    options: dict[str, Any] = {"lr": stage.rate, "weight_decay": _WEIGHT_DECAY}
+    if run.device.type == "cpu":
+        options["fused"] = True  # in one pass over memory: a tenth of a step's time on small images
     if run.options.optimizer == "adamw":
-        return run.torch.optim.AdamW(learning, lr=stage.rate, weight_decay=_WEIGHT_DECAY)
-    return run.torch.optim.SGD(learning, lr=stage.rate, momentum=_MOMENTUM, weight_decay=_WEIGHT_DECAY)
+        return run.torch.optim.AdamW(learning, **options)
+    return run.torch.optim.SGD(learning, momentum=_MOMENTUM, **options)
 
 
 def _scaler(run: _Run) -> Any:
     """Keeps the small gradients of half precision from vanishing; does nothing but on CUDA."""
     return run.torch.amp.GradScaler(run.device.type, enabled=run.device.type == "cuda")
-
-
-def _precision(run: _Run) -> AbstractContextManager[Any]:
-    """Half precision where there is hardware for it."""
-    if run.device.type != "cuda":
-        return nullcontext()
-    context: AbstractContextManager[Any] = run.torch.autocast("cuda", dtype=run.torch.float16)
-    return context
 
 
 def _write_state(run: _Run, optimizer: Any, scaler: Any) -> None:
@@ -249,6 +252,8 @@ class _Curves:
         if self._step and self._path.exists():
             with self._path.open(newline="") as old:
                 kept = [row for row in list(csv.reader(old))[1:] if row and int(row[0]) <= self._step]
+        if kept:
+            self._started -= float(kept[-1][-1])  # seconds of a run that went on are those of all of it
         self._file = self._path.open("w", newline="")
         self._writer = csv.writer(self._file)
         self._writer.writerow(["step", "epoch", "stage", "rate", "loss", *LOSSES, "seconds"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -12,10 +13,12 @@ from semdb.perception.detectors.torchvision import image_tensor
 from semdb.training.coco import CocoData, Picture, mask_of, read_picture
 
 Sample = tuple[Any, dict[str, Any]]  # image [3, H, W], target
+_AHEAD = 2  # batches
+_MOST_READERS = 8
 
 
 def batches(data: CocoData, batch: int, seed: int, epoch: int, start: int, torch: Any) -> Iterator[list[Sample]]:
-    """The batches of an epoch from number `start` on; the next one is read while one is learnt from.
+    """The batches of an epoch from number `start` on; the next two are read while one is learnt from.
 
     Every picture with an object comes once, in an order and with changes (mirrored, brighter or darker) drawn from
     `seed` and `epoch`, so that a run that goes on sees what it would have seen.
@@ -23,15 +26,16 @@ def batches(data: CocoData, batch: int, seed: int, epoch: int, start: int, torch
     order = epoch_order(data, seed, epoch)
     groups = [order[k : k + batch] for k in range(0, len(order), batch)]
 
-    def read(group: list[int]) -> list[Sample]:
-        return [sample(data.pictures[k], np.random.default_rng([seed, 11, epoch, k]), torch) for k in group]
+    def read(number: int) -> Sample:
+        return sample(data.pictures[number], np.random.default_rng([seed, 11, epoch, number]), torch)
 
-    with ThreadPoolExecutor(1, thread_name_prefix="semdb-samples") as pool:
-        waiting = [pool.submit(read, group) for group in groups[start : start + 2]]
+    workers = min(_MOST_READERS, max(1, (os.cpu_count() or 1) // 2))
+    with ThreadPoolExecutor(workers, thread_name_prefix="semdb-samples") as pool:
+        waiting = [[pool.submit(read, number) for number in group] for group in groups[start : start + _AHEAD]]
         for position in range(start, len(groups)):
-            current = waiting.pop(0).result()
-            if position + 2 < len(groups):
-                waiting.append(pool.submit(read, groups[position + 2]))
+            current = [reading.result() for reading in waiting.pop(0)]
+            if position + _AHEAD < len(groups):
+                waiting.append([pool.submit(read, number) for number in groups[position + _AHEAD]])
             yield current
 
 

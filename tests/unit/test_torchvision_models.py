@@ -169,9 +169,7 @@ def test_half_precision_gives_nearly_the_same(tmp_path: Path, monkeypatch: pytes
     spec = trained(tmp_path / "cups.pth")
     image = picture(8, 48, 64)
     exact = load_light(spec).detect(image, None)
-    monkeypatch.setattr(
-        detectors, "inference_precision", lambda device, torch: torch.autocast("cpu", dtype=torch.bfloat16)
-    )
+    monkeypatch.setattr(detectors, "layer_precision", lambda device, torch: torch.autocast("cpu", dtype=torch.bfloat16))
     half = load_light(spec).detect(image, None)
     assert half
     assert abs(half[0].score - exact[0].score) < 0.02
@@ -186,9 +184,7 @@ def test_boxes_are_exact_in_half_precision(tmp_path: Path, monkeypatch: pytest.M
     network.rpn.anchor_generator.register_forward_hook(lambda m, i, anchors: seen.extend(anchors))
     network.rpn.register_forward_hook(lambda m, i, result: seen.extend(result[0]))
     network.backbone.fpn.layer_blocks[0].register_forward_hook(lambda m, i, result: seen.append(result))
-    monkeypatch.setattr(
-        detectors, "inference_precision", lambda device, torch: torch.autocast("cpu", dtype=torch.bfloat16)
-    )
+    monkeypatch.setattr(detectors, "layer_precision", lambda device, torch: torch.autocast("cpu", dtype=torch.bfloat16))
     found = detector.detect(picture(8), None)
     assert [tensor.dtype for tensor in seen] == [torch.bfloat16, torch.float32, torch.float32]
     boxes = torch.from_numpy(np.array([d.box for d in found]))
@@ -346,7 +342,7 @@ def test_half_precision_is_for_cuda_only() -> None:
     made = []
     fake = types.SimpleNamespace(autocast=lambda *a, **k: made.append((a, k)), float16="half")
     for device in ("cpu", "mps", "cuda:1"):
-        torch_models.inference_precision(torch.device(device), fake)
+        torch_models.layer_precision(torch.device(device), fake)
     assert made == [(("cuda",), {"dtype": "half"})]
 
 

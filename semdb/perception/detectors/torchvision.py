@@ -17,7 +17,7 @@ from semdb.perception.mask_rcnn import Architecture
 from semdb.perception.model_files import canonical_json, file_sha256, first_line
 from semdb.perception.torch_models import (
     import_torch,
-    inference_precision,
+    layer_precision,
     prepare,
     read_checkpoint,
     resolve_checkpoint,
@@ -89,7 +89,7 @@ class TorchvisionDetector:
     def _run(self, images: Sequence[ImageArray]) -> list[dict[str, Any]]:
         torch = self._torch
         try:
-            with torch.inference_mode(), inference_precision(self._device, torch):
+            with torch.inference_mode(), layer_precision(self._device, torch):
                 return mask_rcnn.infer(self._network, image_tensors(images, self._device, torch), self._score_threshold)
         except RuntimeError as error:  # torch's errors, out of memory among them
             what = f"{len(images)} images of {images[0].shape[1]}x{images[0].shape[0]}"

@@ -15,7 +15,7 @@ from semdb.perception.encoders.onnx import CROP, SHORT_SIDE, centre_batch, unit_
 from semdb.perception.model_files import canonical_json, file_sha256, first_line
 from semdb.perception.torch_models import (
     import_torch,
-    inference_precision,
+    layer_precision,
     load_weights,
     prepare,
     read_checkpoint,
@@ -64,7 +64,7 @@ class TorchvisionEncoder:
         torch = self._torch
         batch = to_device(np.concatenate([centre_batch(image) for image in images]), self._device, torch)
         try:
-            with torch.inference_mode(), inference_precision(self._device, torch):
+            with torch.inference_mode(), layer_precision(self._device, torch):
                 found = self._network(batch).float().cpu().numpy()
         except RuntimeError as error:
             raise ModelError(
