@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import TypeVar
 
 import cv2
@@ -14,7 +15,7 @@ from semdb.perception.detectors import load_detector
 from semdb.perception.encoders import load_encoder
 from semdb.perception.lifting import lift
 from semdb.perception.objects import assign_to_objects, object_geometry, sort_by_object
-from semdb.perception.protocols import Detector, Encoder, FeatureExtractor
+from semdb.perception.protocols import BatchDetector, BatchEncoder, Detector, Encoder, FeatureExtractor
 from semdb.settings import Settings
 from semdb.types import (
     Camera,
@@ -31,6 +32,20 @@ from semdb.types import (
 )
 
 _Result = TypeVar("_Result")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """An RGB `image` ``[H, W, 3]`` seen by `camera`, with what came with it.
+
+    `depth` ``[H, W]`` is metres with NaN where missing, None where there is none: then all points are NaN. `instances`
+    are the masks of a recording that brings them.
+    """
+
+    image: ImageArray
+    depth: Float32Array | None
+    camera: Camera
+    instances: InstanceMasks | None = None
 
 
 class Describer:
@@ -66,21 +81,50 @@ class Describer:
         camera: Camera,
         instances: InstanceMasks | None = None,
     ) -> Description:
-        """All that can be said of an RGB `image` ``[H, W, 3]`` seen by `camera`.
+        """All that can be said of an image; the arguments are those of `View`.
 
-        `depth` ``[H, W]`` is metres with NaN where missing, or None: then all points are NaN. ``timing_ms`` has the
-        wall time of `detect`, `encode` and `features` (which includes objects and 3D points). Raises FrameError
-        when sizes disagree, ModelError when a model fails, UsageError when the detector needs masks that the image
-        does not bring.
+        ``timing_ms`` has the wall time of `detect`, `encode` and `features` (which includes objects and 3D points).
+        Raises FrameError when sizes disagree, ModelError when a model fails, UsageError when the detector needs masks
+        that the image does not bring.
         """
-        _check_sizes(image, depth, camera)
-        (detections, sightings), detect_ms = _timed(lambda: self._detect(image, instances))
-        vector, encode_ms = _timed(lambda: self.encoder.encode(image))
-        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        found, extract_ms = _timed(lambda: self.features.extract(grey, self.rules.still(detections)))
-        (keypoints, geometry), lift_ms = _timed(lambda: _join(camera, depth, detections, found, self.rules.depth_gap))
+        return self.describe_batch([View(image, depth, camera, instances)])[0]
+
+    def describe_batch(self, views: Sequence[View]) -> list[Description]:
+        """What `describe` says of each of `views`, within rounding; networks that can take them all at once.
+
+        So a GPU is kept busy: each image alone is too little work for it. On a CPU it brings nothing. Images of one
+        size go through a network together; how many fit into the device's memory is for the caller to choose. Times of
+        networks are equal shares of the whole. Raises what `describe` raises.
+        """
+        for view in views:
+            _check_sizes(view.image, view.depth, view.camera)
+        found, detect_ms = _timed(lambda: self._detect(views))
+        vectors, encode_ms = _timed(lambda: self._encode([view.image for view in views]))
+        shares = {"detect": detect_ms / max(1, len(views)), "encode": encode_ms / max(1, len(views))}
+        return [self._finish(*each, shares) for each in zip(views, found, vectors, strict=True)]
+
+    def _detect(self, views: Sequence[View]) -> list[tuple[Detection, ...]]:
+        """What the detector finds, before the rules."""
+        if isinstance(self.detector, BatchDetector):
+            return self.detector.detect_batch([view.image for view in views])
+        return [self.detector.detect(view.image, view.instances) for view in views]
+
+    def _encode(self, images: Sequence[ImageArray]) -> Sequence[Float32Array]:
+        if isinstance(self.encoder, BatchEncoder) and len(images):
+            return list(self.encoder.encode_batch(images))
+        return [self.encoder.encode(image) for image in images]
+
+    def _finish(
+        self, view: View, found: tuple[Detection, ...], vector: Float32Array, timing_ms: dict[str, float]
+    ) -> Description:
+        (detections, sightings), rules_ms = _timed(lambda: self._judge(found, view.image.shape[0]))
+        grey = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY)
+        features, extract_ms = _timed(lambda: self.features.extract(grey, self.rules.still(detections)))
+        (keypoints, geometry), lift_ms = _timed(
+            lambda: _join(view.camera, view.depth, detections, features, self.rules.depth_gap)
+        )
         return Description(
-            camera=camera,
+            camera=view.camera,
             detections=detections,
             geometry=geometry,
             keypoints=keypoints,
@@ -88,17 +132,18 @@ class Describer:
             models=self.models,
             dynamic=frozenset(self.rules.dynamic),
             sightings=sightings,
-            timing_ms={"detect": detect_ms, "encode": encode_ms, "features": extract_ms + lift_ms},
+            timing_ms={
+                "detect": timing_ms["detect"] + rules_ms,
+                "encode": timing_ms["encode"],
+                "features": extract_ms + lift_ms,
+            },
             grey=grey,
         )
 
-    def _detect(
-        self, image: ImageArray, instances: InstanceMasks | None
-    ) -> tuple[tuple[Detection, ...], tuple[Sighting, ...]]:
+    def _judge(self, found: tuple[Detection, ...], height: int) -> tuple[tuple[Detection, ...], tuple[Sighting, ...]]:
         """What is kept as objects, and all that was seen, of the classes that count."""
-        found = self.detector.detect(image, instances)
         counted = [d for d in found if self.rules.classes is None or d.category in self.rules.classes]
-        sightings = tuple(d.sighting(image.shape[0]) for d in counted)
+        sightings = tuple(d.sighting(height) for d in counted)
         return self.rules.apply([d for d in found if not d.weak]), sightings
 
 

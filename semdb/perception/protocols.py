@@ -7,7 +7,7 @@ by its spec string. Objects must be safe to call from several threads, one call 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from semdb.types import BoolArray, Detection, Features, Float32Array, ImageArray, InstanceMasks, ModelInfo
 
@@ -33,6 +33,7 @@ class Detector(Protocol):
         ...
 
 
+@runtime_checkable
 class BatchDetector(Detector, Protocol):
     """A detector that is faster on several images at once."""
 
@@ -55,6 +56,7 @@ class Encoder(Protocol):
         ...
 
 
+@runtime_checkable
 class BatchEncoder(Encoder, Protocol):
     """An encoder that is faster on several images at once."""
 

@@ -19,12 +19,14 @@ import torchvision
 from semdb.errors import ModelError, UsageError
 from semdb.perception import torch_models
 from semdb.perception.catalogue import BY_NAME
+from semdb.perception.describe import View, describer_from_specs
 from semdb.perception.detectors import load_detector
 from semdb.perception.detectors import torchvision as detectors
 from semdb.perception.encoders import load_encoder
 from semdb.perception.encoders.onnx import centre_batch
 from semdb.perception.mask_rcnn import Architecture, build, modern_names
 from semdb.settings import Settings
+from semdb.types import Camera
 from tests.unit.torch_checkpoints import light, mask_rcnn, old_names, write_places365
 
 SMALL = Architecture("resnet18", min_size=64, max_size=128)
@@ -162,6 +164,33 @@ def test_batch_and_single_agree(tmp_path: Path) -> None:
             np.testing.assert_allclose(a.box, b.box, atol=1e-2)
             assert np.mean(a.mask != b.mask) < 1e-3
     assert detector.detect_batch([]) == []
+
+
+def test_images_described_at_once_are_as_one_by_one(tmp_path: Path) -> None:
+    """One pass of the encoder for all, one of the detector for each size."""
+    torch.save(torchvision.models.resnet18(weights=None).state_dict(), tmp_path / "r18.pth")
+    specs = (trained(tmp_path / "cups.pth"), f"torchvision:{tmp_path}/r18.pth", "surf")
+    describer: Any = describer_from_specs(*specs, settings())
+    light(describer.detector._network)
+    passes: list[tuple[int, ...]] = []
+    for network in (describer.detector._network.backbone, describer.encoder._network):
+        network.register_forward_hook(lambda m, inputs, result: passes.append(tuple(inputs[0].shape)))
+    views = []
+    for seed, (height, width) in enumerate([(96, 128), (128, 96), (96, 128)]):
+        camera = Camera(width, height, 100.0, 100.0, width / 2, height / 2)
+        views.append(View(picture(seed, height, width), np.full((height, width), 2, np.float32), camera))
+    together = describer.describe_batch(views)
+    assert passes == [(2, 3, 64, 96), (1, 3, 96, 64), (3, 3, 224, 224)]
+    for view, one in zip(views, together, strict=True):
+        alone = describer.describe(view.image, view.depth, view.camera)
+        assert len(alone.detections) == len(one.detections) > 0
+        np.testing.assert_allclose([d.score for d in alone.detections], [d.score for d in one.detections], atol=1e-4)
+        np.testing.assert_allclose(alone.cnn_vector, one.cnn_vector, atol=1e-4)
+        assert len(alone.sightings) == len(one.sightings)
+        np.testing.assert_array_equal(alone.keypoints.features.xy, one.keypoints.features.xy)
+        np.testing.assert_allclose(alone.geometry[0].centroid, one.geometry[0].centroid, atol=0.05)
+        assert set(one.timing_ms) == {"detect", "encode", "features"}
+    assert describer.describe_batch([]) == []
 
 
 def test_half_precision_gives_nearly_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
