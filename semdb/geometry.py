@@ -125,6 +125,14 @@ def so3_exp(omega: npt.ArrayLike) -> FloatArray:
     return np.asarray(np.eye(3) + a * k + b * k @ k)
 
 
+def so3_log(rotation: FloatArray) -> FloatArray:
+    """Rotation vector ``[3]`` in radians, at most pi long, of a rotation ``[3, 3]``: the inverse of `so3_exp`."""
+    q = quat_wxyz_from_rotation(rotation)
+    q = q if q[0] >= 0 else -q
+    sine = float(np.linalg.norm(q[1:]))
+    return np.asarray(q[1:] * (2 * np.arctan2(sine, q[0]) / sine if sine > 1e-12 else 2.0))
+
+
 def rotation_angle_deg(rotation: FloatArray) -> float:
     """Angle of a rotation in degrees by atan2, exact near 0 and near 180."""
     q = quat_wxyz_from_rotation(rotation)

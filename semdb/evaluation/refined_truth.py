@@ -8,19 +8,20 @@ are brought back to the given world frame by one similarity, so that only what v
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
 from semdb.errors import RecordingError
 from semdb.evaluation.baselines import points_at
-from semdb.evaluation.colmap import HALF_PIXEL, PosedImages, SiftExtractor, image_points
+from semdb.evaluation.colmap import HALF_PIXEL, PosedImages, SiftExtractor, SiftImage, image_points
 from semdb.evaluation.rgbd_bundle import adjust
+from semdb.evaluation.rolling_shutter import readout_step, unrolled
 from semdb.geometry import pose_distances, pose_error, pose_from, project_to_so3
 from semdb.types import BoolArray, Camera, Float32Array, FloatArray, ImageArray
 
-ROUNDS = 2  # of triangulation with the poses so far and bundle adjustment
+ROUNDS = 3  # of triangulation with the poses so far and bundle adjustment
 NEAREST = 4  # pairs of every frame with those nearest in pose
 SPREAD = 8  # and with others at growing distance
 FARTHEST = 3.0  # of `pose_distances`: what is farther apart hardly sees the same
@@ -34,12 +35,14 @@ class Refinement:
     """`world_from_camera` ``[n, 4, 4]`` in the given world frame; where not `refined` ``[n]``, the given pose.
 
     `scale` is what the reconstruction was multiplied by: near 1 where depth and given poses agree on the metre.
+    `readout_s` is the time from the first row of an image to the last that the images agree best with.
     `given_px` and `refined_px` are mean reprojection errors of points triangulated with the poses of each.
     """
 
     world_from_camera: FloatArray
     refined: BoolArray
     scale: float
+    readout_s: float
     points: int
     given_px: float
     refined_px: float
@@ -49,7 +52,7 @@ class Refinement:
 class Disagreement:
     """How far the given poses are from the refined ones, over the refined frames, and between neighbours in time.
 
-    `scale`, `given_px` and `refined_px` are those of the `Refinement`.
+    `scale`, `readout_s`, `given_px` and `refined_px` are those of the `Refinement`.
     """
 
     frames: int
@@ -63,6 +66,7 @@ class Disagreement:
     median_step_translation_m: float | None  # of the motion from one refined frame to the next
     median_step_rotation_deg: float | None
     scale: float
+    readout_s: float
     given_px: float
     refined_px: float
 
@@ -106,19 +110,23 @@ def refine_poses(
     cameras: Sequence[Camera],
     frames: Callable[[int], tuple[ImageArray, Float32Array | None]],
     given: FloatArray,
+    rates: FloatArray,
     *,
     name: str = "",
     progress: Progress | None = None,
 ) -> Refinement:
     """Bundle adjustment of all frames from their `given` poses ``[n, 4, 4]``.
 
+    `rates` ``[n, 3]`` is how the camera turns in each frame, in radians a second in its own frame (zeros: it stands
+    still, or nobody knows): keypoints are taken as at the time of the middle row, see `rolling_shutter`.
     `frames` gives image ``[H, W, 3]`` and depth ``[H, W]`` (or None) at a position. Cameras stay as they are: only
     poses and points move. Raises ModelError without pycolmap and RecordingError where fewer than three frames see
     enough common points.
     """
-    posed, points = _describe(cameras, frames, len(given), name, progress)
+    described, measured = _describe(cameras, frames, len(given), name, progress)
+    posed, points = PosedImages(cameras, described), measured
     posed.match(choose_pairs(given), lambda done, total: _tell(progress, f"matching {name}", done, total))
-    poses = given
+    poses, readout_s = given, 0.0
     errors = []
     for done in range(ROUNDS + 1):
         model = posed.triangulate(poses)
@@ -127,6 +135,8 @@ def refine_poses(
             raise _nothing_common(name, found)
         errors.append(float(model.compute_mean_reprojection_error()))
         if done < ROUNDS:
+            readout_s += readout_step(model, described, posed, rates, readout_s)
+            posed.images, points = _unrolled(described, measured, cameras, rates, readout_s)
             poses = adjust(model, posed, points)
         _tell(progress, f"bundle adjustment of {name}", done + 1, ROUNDS + 1)
     refined = np.array([len(image_points(model, i + 1)[0]) for i in range(len(given))]) >= MIN_POINTS
@@ -135,7 +145,7 @@ def refine_poses(
     aligned, scale = align_poses(poses[refined], given[refined])
     result = given.copy()
     result[refined] = aligned
-    return Refinement(result, refined, scale, found, errors[0], errors[-1])
+    return Refinement(result, refined, scale, readout_s, found, errors[0], errors[-1])
 
 
 def _describe(
@@ -144,7 +154,7 @@ def _describe(
     count: int,
     name: str,
     progress: Progress | None,
-) -> tuple[PosedImages, list[FloatArray]]:
+) -> tuple[list[SiftImage], list[FloatArray]]:
     """SIFT of all frames, and the camera-frame points ``[k, 3]`` of its keypoints from depth."""
     extractor = SiftExtractor()
     described, points = [], []
@@ -154,7 +164,23 @@ def _describe(
         xy = (described[-1].xy - HALF_PIXEL).astype(np.float32)
         points.append(np.full((len(xy), 3), np.nan) if depth is None else points_at(xy, depth, cameras[i]))
         _tell(progress, f"SIFT of {name}", i + 1, count)
-    return PosedImages(cameras, described), points
+    return described, points
+
+
+def _unrolled(
+    described: Sequence[SiftImage],
+    points: Sequence[FloatArray],
+    cameras: Sequence[Camera],
+    rates: FloatArray,
+    readout_s: float,
+) -> tuple[list[SiftImage], list[FloatArray]]:
+    """Keypoints of all images, and their points, as at the time of the middle row."""
+    images, moved = [], []
+    for i, image in enumerate(described):
+        xy, local = unrolled(image.xy, points[i], cameras[i], rates[i], readout_s)
+        images.append(replace(image, xy=xy))
+        moved.append(local)
+    return images, moved
 
 
 def disagreement(given: FloatArray, refinement: Refinement) -> Disagreement:
@@ -181,6 +207,7 @@ def disagreement(given: FloatArray, refinement: Refinement) -> Disagreement:
         median_step_translation_m=float(np.median(steps[:, 0])) if len(steps) else None,
         median_step_rotation_deg=float(np.median(steps[:, 1])) if len(steps) else None,
         scale=refinement.scale,
+        readout_s=refinement.readout_s,
         given_px=refinement.given_px,
         refined_px=refinement.refined_px,
     )

@@ -187,15 +187,17 @@ def truth_grids(results: Sequence[EvaluationResult]) -> list[Grid]:
             errors(found.median_step_translation_m, found.median_step_rotation_deg),
             f"{found.given_px:.2f} / {found.refined_px:.2f}",
             f"{found.scale:.4f}",
+            f"{1000 * found.readout_s:.0f} ms",
         )
         for recording, found in first.items()
         if found is not None
     ]
     errors_of = ("median m / °", "90 % m / °", "largest m / °", "frame to frame m / °")
-    headers = ("recording", "refined frames", *errors_of, "pixels given / refined", "scale")
+    headers = ("recording", "refined frames", *errors_of, "pixels given / refined", "scale", "readout")
     note = (
         "How far the given poses of the frames are from those that bundle adjustment finds; pixels: mean reprojection "
-        "error of points triangulated with the poses of each; scale: metres of the given poses per metre of depth."
+        "error of points triangulated with the poses of each; scale: metres of the given poses per metre of depth; "
+        "readout: from the first row of an image to the last, found from the images (rolling shutter)."
     )
     errors_rows = []
     for result in compared:

@@ -11,12 +11,14 @@ import numpy as np
 from semdb.evaluation.protocols import PAPER, SPLIT, evenly_spaced, split_paper
 from semdb.evaluation.published import PaperRow, counts_like, sequence_of
 from semdb.evaluation.refined_truth import Disagreement, disagreement, refine_poses
+from semdb.evaluation.rolling_shutter import rates_between
 from semdb.keyframes import select_keyframes
 from semdb.recordings.base import FrameEntry, Recording
 from semdb.types import Camera, Float32Array, FloatArray, ImageArray
 
 GIVEN = "given"
 REFINED = "refined"
+USUAL_RATE = 30.0  # frames a second, where a recording has no times
 
 Progress = Callable[[str, int, int], None]
 Say = Callable[[str], None]
@@ -169,7 +171,7 @@ def refine_truth(task: Task, *, both: bool, progress: Progress | None) -> list[T
         recording, entry = rows[i]
         return recording.read_image(entry), recording.read_depth(entry)
 
-    found = refine_poses(cameras, frame, given, name=task.name, progress=progress)
+    found = refine_poses(cameras, frame, given, _turn_rates(rows), name=task.name, progress=progress)
     old = {_key(*row): pose for row, pose in zip(rows, given, strict=True)}
     new = {
         _key(*row): pose for row, pose, good in zip(rows, found.world_from_camera, found.refined, strict=True) if good
@@ -184,6 +186,23 @@ def refine_truth(task: Task, *, both: bool, progress: Progress | None) -> list[T
         disagreement=figures,
     )
     return [replace(task, other_truth=new, disagreement=figures), better] if both else [better]
+
+
+def _turn_rates(rows: Sequence[tuple[Recording, FrameEntry]]) -> FloatArray:
+    """How the camera turns in each of the frames, ``[n, 3]``: as the recording says, or from the frames around."""
+    known: dict[Key, FloatArray] = {}
+    for recording in dict.fromkeys(recording for recording, _ in rows):
+        posed = [(entry, entry.world_from_camera) for entry in recording.entries]
+        entries = [entry for entry, pose in posed if pose is not None]
+        poses = np.stack([pose for _, pose in posed if pose is not None])
+        between = rates_between(poses, np.array([_time_s(entry) for entry in entries]))
+        for entry, rate in zip(entries, between, strict=True):
+            known[_key(recording, entry)] = rate if entry.turn_rate is None else entry.turn_rate
+    return np.stack([known[_key(*row)] for row in rows])
+
+
+def _time_s(entry: FrameEntry) -> float:
+    return entry.index / USUAL_RATE if entry.timestamp_ns is None else entry.timestamp_ns * 1e-9
 
 
 def _key(recording: Recording, entry: FrameEntry) -> Key:

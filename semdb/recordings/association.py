@@ -11,10 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from semdb.errors import RecordingError
-from semdb.geometry import pose_from, rotation_from_quat_wxyz, slerp_wxyz
+from semdb.geometry import pose_from, rotation_from_quat_wxyz, slerp_wxyz, so3_log
 from semdb.types import FloatArray
 
 MAX_TIME_DIFFERENCE_NS = 20_000_000
+TURN_WINDOW_NS = 50_000_000
 NORM_TOLERANCE = 0.05  # data sets round quaternions to four digits; more than this is no rotation
 
 Int64Array = npt.NDArray[np.int64]
@@ -163,6 +164,15 @@ def pose_at(trajectory: Trajectory, time_ns: int) -> tuple[FloatArray | None, in
     quat_wxyz = slerp_wxyz(trajectory.quat_wxyz[before], trajectory.quat_wxyz[after], fraction)
     translation = (1 - fraction) * trajectory.translation[before] + fraction * trajectory.translation[after]
     return pose_from(rotation_from_quat_wxyz(quat_wxyz), translation), gap
+
+
+def turn_rate_at(trajectory: Trajectory, time_ns: int) -> FloatArray | None:
+    """How the camera turns at a time: radians a second ``[3]`` in its own frame, over 50 ms; None at the ends."""
+    before, _ = pose_at(trajectory, time_ns - TURN_WINDOW_NS // 2)
+    after, _ = pose_at(trajectory, time_ns + TURN_WINDOW_NS // 2)
+    if before is None or after is None:
+        return None
+    return so3_log(before[:3, :3].T @ after[:3, :3]) / (TURN_WINDOW_NS * 1e-9)
 
 
 def nearest_pairs(first_ns: Int64Array, second_ns: Int64Array) -> tuple[list[int | None], Int64Array]:

@@ -22,7 +22,8 @@ class FrameEntry:
 
     `index` is stable: 7-Scenes the number in the file name, the other layouts the position (from 0) in the colour
     list sorted by time; it does not depend on which other frames can be used. `world_from_camera` ``[4, 4]`` is
-    the colour camera's pose, rotation in SO(3).
+    the colour camera's pose, rotation in SO(3). `turn_rate` ``[3]`` is how the camera turns meanwhile, in radians a
+    second in its own frame, where the trajectory is finer than the frames.
     """
 
     index: int
@@ -32,6 +33,7 @@ class FrameEntry:
     depth_path: Path | None
     masks_path: Path | None
     world_from_camera: FloatArray | None
+    turn_rate: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True)

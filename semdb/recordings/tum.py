@@ -18,6 +18,7 @@ from semdb.recordings.association import (
     pose_at,
     read_file_list,
     read_trajectory,
+    turn_rate_at,
 )
 from semdb.recordings.base import DroppedFrame, FrameEntry, Recording
 from semdb.recordings.cameras import CAMERA_FILE, TUM_DEPTH_SCALE, read_camera_file, tum_camera
@@ -145,13 +146,14 @@ def _associate(
             reason = f"no depth image within {LIMIT_MS:g} ms (the nearest: {gap / 1e6:.1f} ms)"
             draft.dropped.append(DroppedFrame(file.name, reason))
             continue
-        pose = None
+        pose, turn_rate = None, None
         if trajectory is not None:
             pose, pose_gap = pose_at(trajectory, file.time_ns)
             if pose is None:
                 reason = f"no pose within {LIMIT_MS:g} ms (the nearest: {pose_gap / 1e6:.1f} ms)"
                 draft.dropped.append(DroppedFrame(file.name, reason))
                 continue
+            turn_rate = turn_rate_at(trajectory, file.time_ns)
         draft.entries.append(
             FrameEntry(
                 index=index,
@@ -161,5 +163,6 @@ def _associate(
                 depth_path=draft.path / depth[match].name if depth is not None and match is not None else None,
                 masks_path=None if draft.categories is None else draft.path / "masks" / f"{Path(file.name).stem}.png",
                 world_from_camera=pose,
+                turn_rate=turn_rate,
             )
         )

@@ -21,6 +21,7 @@ from semdb.evaluation.colmap import (
 from semdb.evaluation.colmap_method import ColmapReference
 from semdb.evaluation.refined_truth import align_poses, choose_pairs, disagreement, refine_poses
 from semdb.evaluation.rgbd_bundle import BASELINE_M, virtual_pixels
+from semdb.evaluation.rolling_shutter import rates_between
 from semdb.geometry import back_project, pose_error, pose_from, project, so3_exp
 from semdb.types import Camera, Float32Array, FloatArray, Frame, ImageArray, Verdict
 
@@ -38,10 +39,18 @@ def texture(seed: int) -> Float32Array:
 TEXTURES = [texture(seed) for seed in range(6)]
 
 
-def view(pose: FloatArray, camera: Camera = CAMERA) -> tuple[ImageArray, Float32Array]:
-    """Colour and depth of a box with a texture of its own on every wall, seen from inside."""
+def view(
+    pose: FloatArray, camera: Camera = CAMERA, rate: FloatArray | None = None, readout_s: float = 0.0
+) -> tuple[ImageArray, Float32Array]:
+    """Colour and depth of a box with a texture of its own on every wall, seen from inside.
+
+    A camera that turns at `rate` while it reads row after row has its `pose` at the middle one.
+    """
     v, u = np.mgrid[: camera.height, : camera.width]
     rays = back_project(camera, np.column_stack([u.ravel(), v.ravel()]), np.ones(u.size))
+    times = (np.arange(camera.height) / camera.height - 0.5) * readout_s
+    turns = np.stack([so3_exp(time * (np.zeros(3) if rate is None else rate)) for time in times])
+    rays = np.einsum("rij,rcj->rci", turns, rays.reshape(camera.height, camera.width, 3)).reshape(-1, 3)
     directions, origin = rays @ pose[:3, :3].T, pose[:3, 3]
     with np.errstate(divide="ignore"):
         t = np.maximum((LOW - origin) / directions, (HIGH - origin) / directions)
@@ -196,7 +205,7 @@ def test_refined_poses_are_nearer_to_the_truth_than_disturbed_ones() -> None:
         ]
     )
     images = [view(pose) for pose in truth]
-    found = refine_poses([CAMERA] * 8, lambda i: images[i], disturbed, name="box")
+    found = refine_poses([CAMERA] * 8, lambda i: images[i], disturbed, np.zeros((8, 3)), name="box")
     assert found.refined.all()
     assert found.scale == pytest.approx(1.0, abs=0.03)
     assert found.refined_px < 0.5 * found.given_px
@@ -214,7 +223,31 @@ def test_refined_poses_are_nearer_to_the_truth_than_disturbed_ones() -> None:
     assert figures.median_step_translation_m > figures.median_translation_m  # independent from frame to frame
 
 
+def test_images_read_row_by_row_tell_how_long_that_takes() -> None:
+    truth = walk(5)
+    rates = np.random.default_rng(6).normal(0, 0.6, (5, 3))  # 60 degrees a second
+    images = [view(pose, rate=rate, readout_s=0.03) for pose, rate in zip(truth, rates, strict=True)]
+    errors = []
+    for known in (np.zeros((5, 3)), rates):
+        found = refine_poses([CAMERA] * 5, lambda i: images[i], truth, known, name="box")
+        errors.append(np.median([pose_error(*pair) for pair in zip(found.world_from_camera, truth, strict=True)], 0))
+    assert found.readout_s == pytest.approx(0.03, abs=0.003)
+    assert disagreement(truth, found).readout_s == found.readout_s
+    assert (errors[1] < 0.25 * errors[0]).all()
+    assert errors[1][0] < 0.004
+    assert errors[1][1] < 0.1
+
+
+def test_rates_come_from_the_poses_around() -> None:
+    poses = np.stack([pose_from(so3_exp([0.0, 0.02 * i, 0.0]), [0, 0, 0]) for i in range(4)])
+    assert rates_between(poses, np.array([0.0, 0.1, 0.2, 0.3])) == pytest.approx(np.tile([0, 0.2, 0], (4, 1)))
+    apart = rates_between(poses, np.array([0.0, 0.1, 0.2, 5.0]))
+    assert apart[1] == pytest.approx([0, 0.2, 0])
+    assert not apart[2:].any()  # too long between them to tell
+    assert not rates_between(poses[:1], np.array([0.0])).any()
+
+
 def test_images_without_anything_in_common_cannot_be_refined() -> None:
     grey = np.full((240, 320, 3), 128, np.uint8)
     with pytest.raises(RecordingError, match=r"box: its poses cannot be refined.*--truth given"):
-        refine_poses([CAMERA] * 3, lambda _: (grey, None), walk(3), name="box")
+        refine_poses([CAMERA] * 3, lambda _: (grey, None), walk(3), np.zeros((3, 3)), name="box")

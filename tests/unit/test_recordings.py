@@ -108,6 +108,22 @@ def test_pose_at_takes_the_last_sample_at_the_end_and_nothing_beyond_20_ms(tmp_p
     assert pose_at(trajectory, 1_500_000_000) == (None, 500_000_000)
 
 
+def test_frames_know_how_the_camera_turns_where_the_trajectory_does(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "walk", n=1)
+    sines = [np.sin(0.01 * i / 2) for i in range(-4, 5)]  # every 10 ms 0.01 rad about z, around 100 s
+    (folder / "groundtruth.txt").write_text(
+        "".join(
+            f"{100 + 0.01 * i:.3f} 0 0 0 0 0 {s} {np.sqrt(1 - s * s)}\n"
+            for i, s in zip(range(-4, 5), sines, strict=True)
+        )
+    )
+    rate = open_recording(folder).entries[0].turn_rate
+    assert rate is not None
+    np.testing.assert_allclose(rate, [0, 0, 1], atol=1e-6)
+    (folder / "groundtruth.txt").write_text("100 0 0 0 0 0 0 1\n")
+    assert open_recording(folder).entries[0].turn_rate is None
+
+
 def test_association_is_one_to_one_and_nearest_first() -> None:
     colour = np.array([0, 10, 100, 200], dtype=np.int64) * 1_000_000
     depth = np.array([9, 95, 106, 230], dtype=np.int64) * 1_000_000
