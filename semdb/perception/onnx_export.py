@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from semdb.errors import ModelError
+from semdb.errors import ModelError, UsageError
 from semdb.perception.catalogue import BY_NAME
 from semdb.perception.detectors.torchvision import known_architecture, load_detector_checkpoint
 from semdb.perception.encoders.onnx import CROP
@@ -39,8 +39,11 @@ def export(spec: str, target: Path, settings: Settings) -> Exported:
     """Writes the network of ``torchvision:NAME`` or ``torchvision:PATH`` to `target` as one ONNX file.
 
     Detectors take ``[1, 3, H, W]`` of any size and carry their class names; encoders take ``[B, 3, 224, 224]``.
-    Raises ModelError when the checkpoint is neither, or torch cannot export it.
+    Raises ModelError when the checkpoint is neither, or torch cannot export it, UsageError when there is no folder for
+    `target`.
     """
+    if not target.parent.is_dir():
+        raise UsageError(f"{target}: {target.parent} is no folder")
     torch = import_torch()
     torch.set_num_threads(settings.threads)
     path = resolve_checkpoint(spec, settings)

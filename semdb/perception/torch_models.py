@@ -18,6 +18,7 @@ from semdb.perception.model_files import first_line, models_dir, resolve_file
 from semdb.settings import Settings
 
 INSTALL = "pip install 'semdb[torch]'"
+_PICKLE, _ZIP = b"\x80", b"PK\x03\x04"  # how files of torch.save begin: the format of before torch 1.6, and today's
 
 
 def import_torch() -> Any:
@@ -89,9 +90,15 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     """
     torch = import_torch()
     try:
+        with path.open("rb") as file:
+            begins = file.read(4)
+        if begins[:1] != _PICKLE and begins != _ZIP:
+            raise ModelError(f"{path} cannot be read as a torch checkpoint: it begins with {begins!r}; is it one?")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # torch warns of its own old file format
             content = torch.load(path, map_location="cpu", weights_only=True)
+    except ModelError:
+        raise
     except Exception as error:  # zip, pickle, struct and runtime errors: torch has no base class for them
         if "weights_only" in str(error).lower() or "Unsupported" in str(error):
             raise ModelError(
@@ -151,12 +158,19 @@ def _some(names: list[Any], count: int = 3) -> str:
 def resolve_checkpoint(spec: str, settings: Settings) -> Path:
     """The file of a spec ``torchvision:NAME`` (a published one, in the models folder) or ``torchvision:PATH``.
 
-    Raises ModelError saying which command fetches it, or that there is no such file.
+    Raises UsageError for a spec that is neither, ModelError saying which command fetches it, or that there is no such
+    file.
     """
     text = spec.removeprefix("torchvision:")
+    if text == spec:
+        raise UsageError(f"{spec}: write torchvision:PATH, or torchvision:NAME with one of {', '.join(BY_NAME)}")
     known = BY_NAME.get(text)
     if known is None:
-        return resolve_file(spec, "torchvision:", "a checkpoint (.pth)", settings)
+        try:
+            return resolve_file(spec, "torchvision:", "a checkpoint (.pth)", settings)
+        except ModelError as error:
+            names = "" if "." in text or "/" in text else f"; published models are {', '.join(BY_NAME)}"
+            raise ModelError(f"{error}{names}") from error
     path = models_dir(settings) / known.file
     if not path.is_file():
         raise ModelError(

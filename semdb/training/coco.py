@@ -67,9 +67,13 @@ def load_coco(folder: Path, split: str, classes: Sequence[str] | None = None) ->
     except (OSError, ValueError) as error:
         raise TrainingError(f"{file} cannot be read as JSON ({error})") from error
     try:
+        if not isinstance(content, dict) or not {"images", "annotations", "categories"} <= set(content):
+            raise TypeError("it is no object with images, annotations and categories")
         return _parse(content, file, _image_folder(folder, split), classes)
-    except (KeyError, TypeError, ValueError) as error:
-        raise TrainingError(f"{file} is not in COCO's format: {type(error).__name__} {error}") from error
+    except KeyError as error:
+        raise TrainingError(f"{file} is not in COCO's format: one of its entries has no {error}") from error
+    except (TypeError, ValueError, AttributeError) as error:
+        raise TrainingError(f"{file} is not in COCO's format: {error}") from error
 
 
 def _image_folder(folder: Path, split: str) -> Path:
@@ -113,7 +117,7 @@ def _parse(content: dict[str, Any], file: Path, images: Path, wanted: Sequence[s
 
 def read_picture(picture: Picture) -> ImageArray:
     """The RGB image ``[H, W, 3]``. Raises TrainingError when it cannot be read or has another size than listed."""
-    image = cv2.imread(str(picture.path), cv2.IMREAD_COLOR)
+    image = cv2.imread(str(picture.path), cv2.IMREAD_COLOR) if picture.path.is_file() else None
     if image is None:
         raise TrainingError(f"{picture.path} (image {picture.image_id}) is not there or is no image")
     if image.shape[:2] != (picture.height, picture.width):

@@ -62,7 +62,8 @@ def train(
 
     `resume` goes on from the checkpoint there, to the same weights as a run that was never cut off. `stop_after` ends
     the run after so many steps in all, with a checkpoint. Raises TrainingError for data or a checkpoint that cannot
-    be used and for a loss that is not finite, UsageError when the output is there already, ModelError for the weights.
+    be used and for a loss that is not finite, UsageError when the output is there already, or not
+    there to go on from, ModelError for the weights.
     """
     torch = import_torch()
     torch.set_num_threads(settings.threads)
@@ -72,9 +73,11 @@ def train(
     path = options.output / CHECKPOINT
     if path.exists() and not resume:
         raise UsageError(f"{path} is there already: go on with --resume, or give another --output")
-    options.output.mkdir(parents=True, exist_ok=True)
+    if resume and not path.exists():
+        raise UsageError(f"{path} is not there, so there is nothing to go on from: leave out --resume to begin")
     device = choose_device(settings.device, torch)
     network, architecture = first_network(options, data.classes, settings)
+    options.output.mkdir(parents=True, exist_ok=True)
     run = _Run(options, data, network.to(device), architecture, device, torch)
     _limit_regions(network, options.rois)
     state = _read_state(path, run) if resume else None

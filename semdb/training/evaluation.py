@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from semdb.errors import ModelError, TrainingError
+from semdb.errors import ModelError, TrainingError, UsageError
 from semdb.perception.protocols import Detector
 from semdb.training.coco import CocoData, Instance, Picture, mask_of, read_picture
 from semdb.types import Detection
@@ -55,14 +55,16 @@ def evaluate_detector(detector: Detector, data: CocoData, progress: Progress | N
 
     The detector must have been loaded with a score threshold of `LEAST_SCORE`: precision is taken over all scores.
     Detections of classes that are not in `data` do not count. Raises ModelError when pycocotools is not installed,
-    TrainingError when the detector knows none of the classes.
+    TrainingError when the detector knows none of the classes, UsageError when it is no network.
     """
+    if detector.classes is None:
+        raise UsageError(f"{detector.info.name} takes masks that come with a recording: nothing to measure")
     try:
         from pycocotools import mask as rle
         from pycocotools.coco import COCO
     except ImportError as error:
         raise ModelError("the evaluation needs pycocotools: pip install 'semdb[torch]'") from error
-    if detector.classes is not None and not set(detector.classes) & set(data.classes[1:]):
+    if not set(detector.classes) & set(data.classes[1:]):
         wanted = ", ".join(data.classes[1:])
         raise TrainingError(f"{detector.info.name} knows none of the classes of {data.file}: {wanted}")
     ids = dict(zip(data.classes[1:], data.category_ids, strict=True))

@@ -14,7 +14,7 @@ import torch
 from typer.testing import CliRunner
 
 from semdb.cli.main import app
-from semdb.errors import ModelError
+from semdb.errors import ModelError, UsageError
 from semdb.perception.detectors import load_detector
 from semdb.perception.encoders import load_encoder
 from semdb.perception.mask_rcnn import Architecture
@@ -112,6 +112,11 @@ def test_encoder_is_the_same(tmp_path: Path) -> None:
     original, file = load_encoder(spec, SETTINGS), load_encoder(f"onnx:{done.path}", SETTINGS)
     assert compare_encoders(original, file, images) < 1e-4
     assert file.encode(images[0]).shape == (2048,)
+
+
+def test_a_target_without_a_folder_is_an_error(checkpoint: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"none/a\.onnx: .*none is no folder"):
+        export(f"torchvision:{checkpoint}", tmp_path / "none" / "a.onnx", SETTINGS)
 
 
 def test_a_difference_is_found() -> None:

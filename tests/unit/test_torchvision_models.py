@@ -250,9 +250,10 @@ def test_images_go_to_the_device_as_bytes() -> None:
         assert torch.equal(tensor, detectors.image_tensor(image, torch))
 
 
-def test_places365_features_are_those_before_the_last_layer(tmp_path: Path) -> None:
+@pytest.mark.parametrize("python2", [False, True])
+def test_places365_features_are_those_before_the_last_layer(python2: bool, tmp_path: Path) -> None:
     (tmp_path / "models").mkdir()
-    network = write_places365(tmp_path / "models" / "resnet50_places365.pth.tar")
+    network = write_places365(tmp_path / "models" / "resnet50_places365.pth.tar", python2=python2)
     encoder: Any = load_encoder("torchvision:resnet50-places365", settings(cache_dir=tmp_path))
     assert encoder.info.name == "torchvision:resnet50-places365"
     images = [picture(10, 240, 320), picture(11, 300, 260), picture(12, 240, 320)]
@@ -294,6 +295,14 @@ def test_missing_file_says_how_to_get_it(name: str, tmp_path: Path) -> None:
     assert str(tmp_path / "models" / BY_NAME[name].file) in text
 
 
+def test_a_spec_that_is_none_is_an_error(tmp_path: Path) -> None:
+    for spec in ("onnx:a.onnx", "maskrcnn_resnet50_fpn"):
+        with pytest.raises(UsageError, match="write torchvision:PATH, or torchvision:NAME with one of maskrcnn"):
+            torch_models.resolve_checkpoint(spec, settings(cache_dir=tmp_path))
+    with pytest.raises(ModelError, match=r"no model file at .*published models are maskrcnn_resnet50_fpn_v2, "):
+        torch_models.resolve_checkpoint("torchvision:maskrcnn_resnet101", settings(cache_dir=tmp_path))
+
+
 class _Runs:
     def __reduce__(self) -> tuple[Any, ...]:
         return (print, ("code was run",))
@@ -309,7 +318,7 @@ def test_wrong_files_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str
         return str(caught.value)
 
     path.write_bytes(b"no checkpoint at all" * 10)
-    assert "cannot be read as a torch checkpoint" in error() or "holds more than weights" in error()
+    assert "cannot be read as a torch checkpoint: it begins with b'no c'" in error()
     torch.save({"model": build(SMALL, 3).state_dict(), "extra": 1}, path)
     assert "knows 3 classes, but without a list of names they must be COCO's 91" in error()
     whole = path.read_bytes()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -159,11 +160,40 @@ def test_wrong_data_and_options_are_named(shapes: Path, tmp_path: Path) -> None:
         tiny(shapes, tmp_path, backbone="vgg")
     with pytest.raises(UsageError, match="not all 0"):
         tiny(shapes, tmp_path, epochs=(0, 0, 0))
+    with pytest.raises(UsageError, match=r"detector\.pth is not there, so there is nothing to go on from"):
+        train(tiny(shapes, tmp_path / "new"), SETTINGS, resume=True)
+    assert not (tmp_path / "new").exists()
     (tmp_path / CHECKPOINT).touch()
     with pytest.raises(UsageError, match="--resume"):
         train(tiny(shapes, tmp_path), SETTINGS)
     with pytest.raises(ModelError, match=r"detector\.pth cannot be read"):
         train(tiny(shapes, tmp_path), SETTINGS, resume=True)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("[]", "not in COCO's format: it is no object with images, annotations and categories"),
+        ('{"images": 3}', "it is no object with images, annotations and categories"),
+        ('{"images": [{"id": 1}], "annotations": [], "categories": []}', "one of its entries has no 'file_name'"),
+        ('{"images": [', "cannot be read as JSON"),
+        ('{"images": [], "annotations": [], "categories": []}', "lists no image"),
+    ],
+)
+def test_a_file_that_is_no_coco_is_named(content: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "annotations").mkdir()
+    (tmp_path / "train").mkdir()
+    (tmp_path / "annotations" / "instances_train.json").write_text(content)
+    with pytest.raises(TrainingError, match=r"annotations/instances_train\.json .*" + re.escape(message)):
+        load_coco(tmp_path, "train")
+
+
+def test_a_missing_picture_is_named(shapes: Path) -> None:
+    picture = load_coco(shapes, "train").pictures[0]
+    with pytest.raises(TrainingError, match=r"gone\.png \(image 1\) is not there or is no image"):
+        read_picture(replace(picture, path=shapes / "gone.png"))
+    with pytest.raises(TrainingError, match=r"1\.png is 64x48, but its entry says 65x48"):
+        read_picture(replace(picture, width=65))
 
 
 def test_resume_with_other_options_is_refused(shapes: Path, tmp_path: Path) -> None:
@@ -234,6 +264,11 @@ def test_scores_of_detectors_that_are_known(shapes: Path) -> None:
     assert turned.class_ap50 == pytest.approx({"disc": 0, "square": 1})
     nothing = evaluate_detector(Perfect(shapes, drop="disc"), load_coco(shapes, "train", ["disc"]))
     assert nothing.boxes.values == nothing.masks.values == (0, 0, 0, 0)
+
+
+def test_masks_of_a_recording_are_not_measured(shapes: Path) -> None:
+    with pytest.raises(UsageError, match="recorded takes masks that come with a recording"):
+        evaluate_detector(load_detector("recorded", SETTINGS), load_coco(shapes, "train"))
 
 
 def test_the_papers_table() -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import pickle
 import re
+import struct
 from collections import OrderedDict
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 import torchvision
@@ -60,8 +62,11 @@ def light(network: Any) -> Any:
     return network
 
 
-def write_places365(path: Path, outputs: int = 365, seed: int = 0, zipped: bool = False) -> Any:
-    """A file as the publisher of Places365 writes it, from DataParallel and in torch's first format; the network."""
+def write_places365(path: Path, outputs: int = 365, seed: int = 0, python2: bool = False) -> Any:
+    """A file as the publisher of Places365 writes it, from DataParallel and in torch's first format; the network.
+
+    `python2` as torch 0.2 wrote it on a GPU under Python 2, when those networks were trained.
+    """
     torch.manual_seed(seed)
     network = torchvision.models.resnet50(weights=None, num_classes=outputs)
     random_statistics(network, seed)
@@ -71,5 +76,59 @@ def write_places365(path: Path, outputs: int = 365, seed: int = 0, zipped: bool 
         if not name.endswith("num_batches_tracked")  # the file is older than that counter
     )
     content = {"epoch": 90, "arch": "resnet50", "state_dict": state, "best_prec1": 54.77}
-    torch.save(content, path, _use_new_zipfile_serialization=zipped)
+    if python2:
+        save_as_python2(content, path)
+    else:
+        torch.save(content, path, _use_new_zipfile_serialization=False)
     return network.eval()
+
+
+class _Python2Pickler(pickle._Pickler):
+    """Pickles as Python 2 and torch 0.2: texts are byte strings, tensors have no hooks, storages lie on a GPU."""
+
+    dispatch: ClassVar[dict[type, Any]] = dict(pickle._Pickler.dispatch)
+
+    def __init__(self, file: Any) -> None:
+        super().__init__(file, protocol=2)
+        self.storages: dict[str, Any] = {}
+
+    def save_text(self, text: str) -> None:
+        data = text.encode("ascii")
+        self.write(pickle.SHORT_BINSTRING + bytes([len(data)]) + data)
+        self.memoize(text)
+
+    dispatch[str] = save_text
+
+    def persistent_id(self, value: Any) -> Any:
+        if not isinstance(value, _Storage):
+            return None
+        key = str(139_000_000_000_000 + 64 * len(self.storages))  # an address
+        self.storages[key] = value.tensor
+        return ("storage", torch.cuda.FloatStorage, key, "cuda:0", value.tensor.numel(), None)
+
+    def reducer_override(self, value: Any) -> Any:
+        if isinstance(value, torch.Tensor):
+            return torch._utils._rebuild_tensor, (_Storage(value), 0, tuple(value.shape), value.stride())
+        if isinstance(value, OrderedDict):
+            return OrderedDict, ([list(item) for item in value.items()],)
+        return NotImplemented
+
+
+class _Storage:
+    def __init__(self, tensor: Any) -> None:
+        self.tensor = tensor.contiguous()
+
+
+def save_as_python2(content: dict[str, Any], path: Path) -> None:
+    """The first format of torch: three pickles that say what it is, the content, the keys of the storages, their bytes."""
+    with path.open("wb") as file:
+        sizes = {"short": 2, "int": 4, "long": 4}
+        for head in (0x1950A86A20F9469CFC6C, 1001, {"little_endian": True, "type_sizes": sizes}):
+            _Python2Pickler(file).dump(head)
+        pickler = _Python2Pickler(file)
+        pickler.dump(content)
+        keys = sorted(pickler.storages)
+        _Python2Pickler(file).dump(keys)
+        for key in keys:
+            tensor = pickler.storages[key]
+            file.write(struct.pack("<q", tensor.numel()) + tensor.numpy().tobytes())
