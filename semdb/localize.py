@@ -12,7 +12,7 @@ from semdb.database.records import MapInfo
 from semdb.database.store import Store
 from semdb.errors import DatabaseError, FrameError, NotFoundError, ProvenanceError, UsageError
 from semdb.localization.index import IndexOptions, IndexSource, MapIndex
-from semdb.localization.keyframe_cache import KeyframeCache
+from semdb.localization.keyframe_cache import STALE, KeyframeCache
 from semdb.localization.localizer import Localizer, LocalizerOptions
 from semdb.localization.sources import SqlSource
 from semdb.model_choice import settings_of_map, specs_for_query
@@ -79,7 +79,9 @@ def make_localizer(
         say(f"map {info.name!r} has changed since semdb refine; the class confusions of then are used")
     for found in store.class_confusions(info.id):
         confusions.setdefault(found.category, {})[found.other] = found.weight
-    cache = KeyframeCache(store, info.id)
+    cache = KeyframeCache(store, info.id, refined=options is None or options.refined_points)
+    if say is not None and cache.points == STALE:
+        say(f"map {info.name!r} has changed since semdb refine; its refined points are not used: run semdb refine")
     return Localizer(info.name, store.map_models(info.id), source, cache, options, confusions)
 
 

@@ -15,14 +15,18 @@ import numpy as np
 from sqlalchemy import Connection
 from sqlalchemy.exc import IntegrityError
 
-from semdb.database import refinements
-from semdb.database.records import ClassConfusion, MapInfo, MapObject
+from semdb.database import point_rows, refinements
+from semdb.database.records import ClassConfusion, KeyframePoints, MapInfo, MapObject
 from semdb.database.store import Store
-from semdb.errors import DatabaseError, UsageError
+from semdb.errors import DatabaseError, NotFoundError, UsageError
+from semdb.fusion.options import FusionOptions
 from semdb.geometry import transform_points
 from semdb.localization.confusion import ConfusionOptions, PlacedObjects, co_detections, confusions
+from semdb.localization.views import ClassNumbers, View, make_view
 
 CLASSES = "classes"
+POINTS = "points"
+READ_CHUNK = 50
 ATTEMPTS = 3  # of a step while the map changes under it
 Progress = Callable[[str, int, int], None]  # what, done, total
 
@@ -84,7 +88,54 @@ class ClassStep:
         return refinements.replace_confusions(connection, map_id, result)
 
 
-STEPS: tuple[Step, ...] = (ClassStep(),)
+@dataclass(frozen=True, slots=True)
+class PointStep:
+    """3D points that several keyframes agree on."""
+
+    options: FusionOptions = field(default_factory=FusionOptions)
+    kind: str = POINTS
+    summary: str = "points that several keyframes see"
+
+    @property
+    def parameters(self) -> Mapping[str, Any]:
+        return asdict(self.options)
+
+    def compute(self, store: Store, map_id: int, progress: Callable[[int, int], None]) -> list[KeyframePoints]:
+        """Raises NotFoundError where a keyframe is deleted meanwhile."""
+        from semdb.fusion.overlap import volume_of
+        from semdb.fusion.refined import refine_points
+
+        ids = [listed.id for listed in store.listed_keyframes(map_id)]
+        numbers, volumes, counts = ClassNumbers(), [], []
+        for start in range(0, len(ids), READ_CHUNK):
+            for known in store.load_keyframes(ids[start : start + READ_CHUNK], descriptors=False):
+                keypoints = known.keypoints
+                volumes.append(
+                    volume_of(known.camera, known.world_from_camera, keypoints.features.xy, keypoints.points)
+                )
+                counts.append(len(keypoints))
+            progress(len(volumes), 2 * len(ids))
+
+        def load(number: int) -> View:
+            (known,) = store.load_keyframes([ids[number]])
+            names = [thing.category for thing in known.objects]
+            return make_view(known.camera, known.keypoints, names, numbers)
+
+        def show(done: int, total: int) -> None:
+            progress(total + done, 2 * total)
+
+        results = []
+        for number, found in refine_points(volumes, load, self.options, show):
+            points = np.full((counts[number], 4), np.nan, np.float32)
+            points[found.keypoints] = found.points
+            results.append(KeyframePoints(ids[number], points, found.fused, found.triangulated))
+        return results
+
+    def write(self, connection: Connection, map_id: int, result: Sequence[KeyframePoints]) -> int:
+        return point_rows.replace_points(connection, map_id, result)
+
+
+STEPS: tuple[Step, ...] = (ClassStep(), PointStep())
 
 
 def placed_objects(objects: Iterable[MapObject]) -> tuple[PlacedObjects, list[str]]:
@@ -143,10 +194,14 @@ def _run(store: Store, info: MapInfo, step: Step, progress: Progress | None) -> 
         if progress is not None:
             progress(f"{info.name}: {step.summary}", done, total)
 
-    failure: IntegrityError | None = None
+    failure: Exception | None = None
     for attempt in range(1, ATTEMPTS + 1):
         state = store.map_state(info.id)
-        result = step.compute(store, info.id, show)
+        try:
+            result = step.compute(store, info.id, show)
+        except NotFoundError as error:  # a keyframe was deleted after the map was listed
+            failure = error
+            continue
         same = store.map_state(info.id) == state
         if not same and attempt < ATTEMPTS:
             continue

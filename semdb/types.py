@@ -227,6 +227,7 @@ class Localization:
     reason: str  # one line for people: why this verdict
     timing_ms: Mapping[str, float]
     evidence: Mapping[str, float] = field(default_factory=dict)  # what verdict and confidence were made from
+    refinements: Mapping[str, str] = field(default_factory=dict)  # what became of those of the map: used, stale, none
     # for plots: the best keyframe and its inlier pairs (pixels as seen)
     best_keyframe_id: int | None = None
     query_xy: Float32Array | None = None  # [m, 2]

@@ -105,6 +105,7 @@ def as_json(answer: ImageLocalization) -> dict[str, Any]:
             }
             for candidate in found.candidates
         ],
+        "refinements": dict(found.refinements),
         "timing_ms": dict(found.timing_ms),
     }
 

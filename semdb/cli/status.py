@@ -40,7 +40,8 @@ def command(
             recordings, failed = look(store, map_name)
             rates.look({recording.recording_id: recording.keyframes for recording in recordings})
             if json:
-                print_json([as_json(recording, failed) for recording in recordings])
+                refined = refinements_of(store)
+                print_json([as_json(item, failed, refined.get(item.map_id, {})) for item in recordings])
             else:
                 if watch and sys.stdout.isatty():
                     print("\033[2J\033[H", end="")  # clear, cursor to the top left
@@ -95,8 +96,16 @@ def look(store: Store, map_name: str | None) -> tuple[list[RecordingStatus], lis
     return recordings, [item for item in store.failed_items() if item.recording_id in known]
 
 
-def as_json(recording: RecordingStatus, failed: list[FailedItem]) -> dict[str, Any]:
-    """What `--json` prints for one recording."""
+def refinements_of(store: Store) -> dict[int, dict[str, str]]:
+    """By map: each step of `semdb refine` that was run, and whether it is ``current`` or ``stale``."""
+    found: dict[int, dict[str, str]] = {}
+    for item in store.refinements():
+        found.setdefault(item.map_id, {})[item.kind] = "current" if item.current else "stale"
+    return found
+
+
+def as_json(recording: RecordingStatus, failed: list[FailedItem], refinements: dict[str, str]) -> dict[str, Any]:
+    """What `--json` prints for one recording. `refinements` are those of its map."""
     return {
         "id": recording.recording_id,
         "map": recording.map,
@@ -110,6 +119,7 @@ def as_json(recording: RecordingStatus, failed: list[FailedItem]) -> dict[str, A
         "objects": recording.objects,
         "keypoints": recording.keypoints,
         "image_bytes": recording.image_bytes,
+        "refinements": refinements,
         "failed": [
             {"frame_index": item.frame_index, "attempts": item.attempts, "error": item.error}
             for item in failed

@@ -191,6 +191,26 @@ class ClassConfusion:
 
 
 @dataclass(frozen=True, slots=True)
+class ListedKeyframe:
+    id: int
+    recording: str
+    frame_index: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframePoints:
+    """Refined points of a keyframe, in the order of its keypoints: X, Y, Z (camera frame) and the sigma of Z, metres.
+
+    NaN where nothing was found. `fused` counts those whose point was measured too, `triangulated` the others.
+    """
+
+    keyframe_id: int
+    points: Float32Array  # [n, 4]
+    fused: int
+    triangulated: int
+
+
+@dataclass(frozen=True, slots=True)
 class Refinement:
     """A step of `semdb refine`. `current`: the map is still as it was then."""
 

@@ -14,6 +14,7 @@ from semdb.database import (
     deletion,
     lookups,
     planning,
+    point_rows,
     reading,
     refinements,
     reporting,
@@ -31,6 +32,7 @@ from semdb.database.records import (
     Deleted,
     FailedItem,
     KeyframeRecord,
+    ListedKeyframe,
     MapInfo,
     MapObject,
     PlannedRecording,
@@ -293,6 +295,14 @@ class Store:
     def class_confusions(self, map_id: int) -> list[ClassConfusion]:
         """Which classes are taken for each other in a map, as of the last `semdb refine`."""
         return refinements.load_confusions(self.engine, map_id)
+
+    def listed_keyframes(self, map_id: int) -> list[ListedKeyframe]:
+        """All keyframes of a map in an order that does not depend on ids."""
+        return point_rows.listed_keyframes(self.engine, map_id)
+
+    def refined_points(self, keyframe_ids: Sequence[int]) -> dict[int, Float32Array]:
+        """Refined points ``[n, 4]`` of those keyframes that have any, as of the last `semdb refine`."""
+        return point_rows.load_points(self.engine, keyframe_ids)
 
     # deletion and log
 

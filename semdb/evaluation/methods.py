@@ -76,6 +76,7 @@ METHODS = {
                 verdict=_COUNT_ONLY,
                 neighbours=0,
                 twins=0,
+                refined_points=False,
             ),
         ),
         Method(
@@ -87,6 +88,7 @@ METHODS = {
                 verdict=_COUNT_ONLY,
                 neighbours=0,
                 twins=0,
+                refined_points=False,
             ),
             features="orb",
         ),
@@ -102,6 +104,11 @@ METHODS = {
             "semdb-no-confusion",
             "as semdb with a class standing for itself only, not for those it is taken for",
             LocalizerOptions(coarse=CoarseOptions(confusion=0.0)),
+        ),
+        Method(
+            "semdb-own-points",
+            "as semdb with the 3D points that each keyframe measured, without those of semdb refine",
+            LocalizerOptions(refined_points=False),
         ),
         Method("hard", "as semdb with the hard class filter alone", LocalizerOptions(coarse=_HARD)),
         Method(
@@ -130,6 +137,7 @@ ABLATION = (
     ("cascade", "all", SEMDB),
     ("cascade, counts only", "all", "semdb-counts"),
     ("cascade, no confusion", "all", "semdb-no-confusion"),
+    ("cascade, own points", "all", "semdb-own-points"),
     ("no filter", "on objects", "cnn-objects"),
     ("hard filter", "on objects", "hard-objects"),
     ("cascade", "on objects", "semdb-objects"),

@@ -5,23 +5,30 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import OrderedDict
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
 
 from semdb.database.records import StoredKeyframe
 from semdb.database.store import Store
-from semdb.errors import NotFoundError
+from semdb.errors import CodecError, NotFoundError
 from semdb.geometry import POSE_UNIT_M, pose_distances
 from semdb.localization.coarse import MapChange
 from semdb.localization.views import ClassNumbers, KeyframeView, make_keyframe_view
-from semdb.types import FloatArray, ImageArray
+from semdb.types import Float32Array, FloatArray, ImageArray, Keypoints
+
+POINTS = "points"  # the step of `semdb refine`
+USED, STALE, NONE, OFF = "used", "stale", "none", "off"  # what becomes of its points
 
 
 class KeyframeCache:
-    """Loads keyframes from the database and keeps the `capacity` last used (about 1.3 MiB each)."""
+    """Loads keyframes from the database and keeps the `capacity` last used (about 1.3 MiB each).
 
-    def __init__(self, store: Store, map_id: int, capacity: int = 64) -> None:
+    With `refined` their points are those of `semdb refine`, as long as these belong to what the map holds.
+    """
+
+    def __init__(self, store: Store, map_id: int, capacity: int = 64, *, refined: bool = True) -> None:
         self.numbers = ClassNumbers()
         self._store = store
         self._map_id = map_id
@@ -30,9 +37,23 @@ class KeyframeCache:
         self._names: dict[int, tuple[str, int]] = {}
         self._poses: tuple[list[int], FloatArray] | None = None
         self._stale: set[int] = set()  # keyframes whose poses are to be read again
+        self._refined = refined
+        self._points: str | None = None if refined else OFF
+
+    @property
+    def points(self) -> str:
+        """What becomes of refined points: ``used``, ``stale`` (the map has changed since), ``none`` or ``off``."""
+        if self._points is None:
+            known = [item for item in self._store.refinements(self._map_id) if item.kind == POINTS]
+            self._points = NONE if not known else USED if known[0].current else STALE
+        return self._points
 
     def forget(self, change: MapChange) -> None:
         """Drops what is out of date; poses of added keyframes are read when they are asked for."""
+        if self._refined:
+            if self._points == USED:
+                self._views.clear()  # their points belong to the map as it was
+            self._points = None
         if change.everything:
             self._views.clear()
             self._names.clear()
@@ -58,13 +79,16 @@ class KeyframeCache:
         return found
 
     def _load(self, missing: Sequence[int]) -> None:
+        if not missing:
+            return
+        refined = self._store.refined_points(missing) if self.points == USED else {}
         for stored in self._stored(missing):
             self._names[stored.id] = (stored.recording, stored.frame_index)
             self._views[stored.id] = make_keyframe_view(
                 stored.id,
                 stored.camera,
                 stored.world_from_camera,
-                stored.keypoints,
+                with_refined(stored.keypoints, refined.get(stored.id), stored.id),
                 [found.category for found in stored.objects],
                 self.numbers,
                 self._grey(stored),
@@ -124,3 +148,16 @@ class KeyframeCache:
             self._poses = ids[order].tolist(), np.concatenate([self._poses[1][kept], new_poses])[order]
         self._stale.clear()
         return self._poses
+
+
+def with_refined(keypoints: Keypoints, refined: Float32Array | None, keyframe_id: int) -> Keypoints:
+    """`keypoints` ``[n]`` with the points of `refined` ``[n, 4]`` where there are any. Raises CodecError."""
+    if refined is None:
+        return keypoints
+    if len(refined) != len(keypoints):
+        raise CodecError(
+            f"refined_points of keyframe {keyframe_id}: {len(refined)} points for {len(keypoints)} keypoints; "
+            "run semdb refine --force"
+        )
+    found = np.isfinite(refined[:, 2])[:, None]
+    return replace(keypoints, points=np.where(found, refined[:, :3], keypoints.points).astype(np.float32))

@@ -51,6 +51,7 @@ class LocalizerOptions:
     verdict: VerdictOptions = field(default_factory=VerdictOptions)
     neighbours: int = 1  # keyframes near the first pose that join once it convinces
     twins: int = 1  # keyframes far from the pose that are asked when they look as much like the query
+    refined_points: bool = True  # those of `semdb refine`, where the map has not changed since
     twin_cosine: float = 0.05  # how much less than the best keyframe's cosine is "as much"
 
 
@@ -245,6 +246,7 @@ class Localizer:
             reason=judgement.reason,
             timing_ms=search.timing_ms,
             evidence={} if evidence is None else evidence.as_mapping(),
+            refinements={"points": self.cache.points},
             best_keyframe_id=best,
             query_xy=query_xy,
             keyframe_xy=keyframe_xy,

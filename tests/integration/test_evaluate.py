@@ -146,7 +146,8 @@ def test_the_ablation_has_a_row_for_every_layer(room: Path, tmp_path: Path) -> N
     output = evaluate(room, *FEW, "--ablation", "--json", "a.json", cwd=tmp_path)
     results = read(tmp_path / "a.json")
     assert [result["method"] for result in results] == [
-        "cnn", "hard", "semdb", "semdb-counts", "semdb-no-confusion", "cnn-objects", "hard-objects", "semdb-objects",
+        "cnn", "hard", "semdb", "semdb-counts", "semdb-no-confusion", "semdb-own-points",
+        "cnn-objects", "hard-objects", "semdb-objects",
     ]  # fmt: skip
     assert {result["queries"] for result in results} == {4}
     assert "Ablation on" in output

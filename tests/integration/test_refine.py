@@ -16,9 +16,16 @@ from semdb.database.records import ClassConfusion, MapInfo
 from semdb.database.store import Store, open_store
 from semdb.errors import DatabaseError, NotFoundError, UsageError
 from semdb.geometry import invert_pose, transform_points
-from semdb.refine import ClassStep, refine_map
+from semdb.refine import CLASSES, ClassStep, StepResult
 from semdb.types import Description, ObjectGeometry
 from tests.database_samples import MODELS, description, plan, pose, record
+
+
+
+def refine_map(store: Store, info: MapInfo, *, force: bool = False) -> list[StepResult]:
+    """The step of classes alone."""
+    return refine.refine_map(store, info, kinds=[CLASSES], force=force)
+
 
 SOFA, LAMP = (0.5, 1.0, 2.0), (-1.0, 0.5, 2.5)
 
@@ -171,7 +178,7 @@ def test_a_map_or_keyframe_that_goes_meanwhile(store: Store, monkeypatch: pytest
     with pytest.raises(NotFoundError, match="deleted while"):
         refine_map(store, info)
     with pytest.raises(UsageError, match="known are"):
-        refine_map(store, info, kinds=["walls"])
+        refine.refine_map(store, info, kinds=["walls"])
 
 
 def test_rows_go_with_their_map(store: Store) -> None:

@@ -181,7 +181,7 @@ def test_options_that_make_no_sense(options: EvaluateOptions, message: str) -> N
 
 def test_every_row_of_the_ablation_is_a_method() -> None:
     assert {name for _, _, name in ABLATION} <= set(METHODS)
-    assert len({(filter_name, keypoints) for filter_name, keypoints, _ in ABLATION}) == 8
+    assert len({(filter_name, keypoints) for filter_name, keypoints, _ in ABLATION}) == 9
     budgets = {
         name: sum((*options.filtered_batches, *options.soft_batches * options.cascade,
                    *options.all_batches * options.cascade))

@@ -1,0 +1,61 @@
+"""What can be varied in refining the points of a map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True, slots=True)
+class GateOptions:
+    """`ceiling` is the greatest squared distance of unit descriptors of a pair (cosine 0.75).
+
+    The gate is `first_px` wide at recorded poses, and three times the noise once two keyframes are laid on each other,
+    at least `least_px` and at most `most_px`.
+    """
+
+    first_px: float = 24.0
+    least_px: float = 4.0
+    most_px: float = 12.0
+    ratio: float = 0.85
+    contradiction_ratio: float = 0.75
+    ceiling: float = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class RegistrationOptions:
+    """Standard deviations are of the recorded pose between two keyframes, `pixel_sigma_px` of a keypoint's pixel."""
+
+    pose_m: float = 0.02
+    pose_rad: float = 0.01
+    pixel_sigma_px: float = 1.0
+    least_points: int = 12  # fewer leave the pose as recorded, and noise from its standard deviations
+
+
+@dataclass(frozen=True, slots=True)
+class DepthOptions:
+    """`fuse` improves measured depths too; without it only missing ones are found.
+
+    A triangulated depth needs a relative standard deviation of at most `most_relative`; where no keyframe measured the
+    point, rays at least `least_parallax_deg` apart besides.
+    """
+
+    fuse: bool = True
+    most_relative: float = 0.05
+    least_parallax_deg: float = 1.5
+
+
+@dataclass(frozen=True, slots=True)
+class FusionOptions:
+    """How many keyframes look at each other, and what is made of it.
+
+    Each is compared with the `neighbours` that have most in common with it (at least `least_share` of their points)
+    among the `candidates` that look nearest by. `block` keyframes are worked on at a time.
+    """
+
+    neighbours: int = 8
+    candidates: int = 32
+    least_share: float = 0.2
+    block: int = 128
+    gate: GateOptions = field(default_factory=GateOptions)
+    registration: RegistrationOptions = field(default_factory=RegistrationOptions)
+    depths: DepthOptions = field(default_factory=DepthOptions)
