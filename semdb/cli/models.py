@@ -149,7 +149,7 @@ def _pictures(paths: list[Path], count: int) -> list[ImageArray]:
 
 
 def _show_megabytes(progress: Progress, done: int, total: int) -> None:
-    progress.update(done >> 20, total >> 20)
+    progress.go_on(done >> 20, total >> 20)
 
 
 def files_folder(settings: Settings) -> Path:

@@ -27,6 +27,7 @@ class Progress:
         self.stream = stream or sys.stderr
         self.terminal = self.stream.isatty() if terminal is None else terminal
         self.started = self.printed = time.monotonic()
+        self._before: int | None = None  # what was done before, by a run or a download that goes on
         self._bar: Any = None
         self._task: Any = None
 
@@ -45,15 +46,21 @@ class Progress:
             self._bar.stop()
             self._bar = None
 
+    def go_on(self, done: int, total: int) -> None:
+        """As `update`, of work that may go on from before: the first call says from where, which is not speed."""
+        if self._before is None:
+            self._before = done
+        self.update(done, total)
+
     def update(self, done: int, total: int) -> None:
         """Say that `done` of `total` are finished. Cheap: may be called for every frame."""
         now = time.monotonic()
-        rate = done / max(now - self.started, 1e-9)
+        rate = (done - (self._before or 0)) / max(now - self.started, 1e-9)
         if self._bar is not None:
             self._bar.update(self._task, completed=done, total=total, rate=f"{rate:.1f} {self.unit}/s")
         elif now - self.printed >= SECONDS_BETWEEN_LINES:
             self.printed = now
-            left = format_duration((total - done) / rate) if done else "?"
+            left = format_duration((total - done) / rate) if rate else "?"
             line = f"{self.label}: {done} of {total} {self.unit}, {rate:.1f}/s, {left} left"
             print(line, file=self.stream, flush=True)
 

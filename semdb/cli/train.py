@@ -78,7 +78,7 @@ def train_detector(
     )
     settings = load_settings(**({} if device is None else {"device": device}))
     with Progress("training", unit="steps") as progress:
-        done = train(options, settings, resume=resume, progress=progress.update)
+        done = train(options, settings, resume=resume, progress=progress.go_on)
     last = f", loss {sum(done.losses[-20:]) / len(done.losses[-20:]):.3f}" if done.losses else ""
     print(f"{done.steps} steps{last}; curves in {done.curves}; use the detector as torchvision:{done.checkpoint}")
 

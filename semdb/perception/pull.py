@@ -104,6 +104,8 @@ def _receive(answer: HTTPResponse, model: Published, part: Path, start: int, pro
     with part.open("r+b" if start else "wb") as file:
         file.seek(start)
         done = start
+        if progress is not None:
+            progress(done, total)
         while chunk := answer.read(_CHUNK):
             file.write(chunk)
             done += len(chunk)

@@ -100,6 +100,8 @@ def _run_stages(
     per_epoch = math.ceil(len(epoch_order(run.data, run.options.seed, 0)) / run.options.batch)
     total = per_epoch * sum(stage.epochs for stage in stages)
     end = total if stop_after is None else min(stop_after, total)
+    if progress is not None:
+        progress(run.step, total)
     first = 0  # step at which the stage begins
     for stage in stages:
         last = first + per_epoch * stage.epochs

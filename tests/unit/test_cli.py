@@ -236,6 +236,21 @@ def test_plain_progress_is_a_line_every_few_seconds(monkeypatch: pytest.MonkeyPa
     ]
 
 
+def test_progress_of_work_that_goes_on_counts_what_is_new(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 100.0
+    monkeypatch.setattr("semdb.cli.progress.time.monotonic", lambda: now)
+    stream = io.StringIO()
+    with Progress("training", "steps", stream=stream) as progress:
+        progress.go_on(600, 640)
+        for done in range(601, 611):
+            now += 1
+            progress.go_on(done, 640)
+    assert stream.getvalue().splitlines() == [
+        "training: 605 of 640 steps, 1.0/s, 0:35 left",
+        "training: 610 of 640 steps, 1.0/s, 0:30 left",
+    ]
+
+
 def test_progress_on_a_terminal_is_a_bar() -> None:
     stream = io.StringIO()
     with Progress("describing", stream=stream, terminal=True) as progress:

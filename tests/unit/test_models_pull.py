@@ -94,6 +94,7 @@ def test_a_file_is_fetched_once_with_progress(server: Server, tmp_path: Path) ->
     done = pull(published(server.url), tmp_path / "models", lambda have, total: seen.append((have, total)))
     assert done.path.read_bytes() == CONTENT
     assert (done.sha256, done.fetched, done.recorded) == (SHA256, True, False)
+    assert seen[0] == (0, len(CONTENT))
     assert seen[-1] == (len(CONTENT), len(CONTENT))
     assert len(seen) > 5
     assert [path.name for path in (tmp_path / "models").iterdir()] == ["weights.pth"]
@@ -109,7 +110,10 @@ def test_a_broken_download_goes_on_where_it_stopped(server: Server, tmp_path: Pa
     assert (tmp_path / "weights.pth.part").stat().st_size == 1_000_000
     assert not (tmp_path / "weights.pth").exists()
     server.break_after = 0
-    assert pull(published(server.url), tmp_path).path.read_bytes() == CONTENT
+    seen: list[tuple[int, int]] = []
+    done = pull(published(server.url), tmp_path, lambda have, total: seen.append((have, total)))
+    assert done.path.read_bytes() == CONTENT
+    assert seen[0] == (1_000_000, len(CONTENT))
     assert server.asked == ["", "bytes=1000000-"]
 
 

@@ -120,7 +120,7 @@ class _Storage:
 
 
 def save_as_python2(content: dict[str, Any], path: Path) -> None:
-    """The first format of torch: three pickles that say what it is, the content, the keys of the storages, their bytes."""
+    """The first format of torch: three pickles that say what it is, content, keys of the storages, their bytes."""
     with path.open("wb") as file:
         sizes = {"short": 2, "int": 4, "long": 4}
         for head in (0x1950A86A20F9469CFC6C, 1001, {"little_endian": True, "type_sizes": sizes}):
