@@ -9,9 +9,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from semdb.geometry import invert_pose, project, transform_points
+from semdb.localization.likeness import likeness_share
 from semdb.localization.pose import PoseEstimate
 from semdb.localization.views import KeyframeView, View
-from semdb.types import BoolArray, Float32Array, FloatArray
+from semdb.types import BoolArray, Float32Array, FloatArray, IntArray
 
 GRID = 4  # cells along each side of the image
 LEAST_CELLS = 4  # fewer cells that keyframes show are too few to speak for a pose
@@ -29,7 +30,7 @@ FEATURES = (
     "spread",
     "explained",
     "query share",
-    "aligned",
+    "likeness",
     "confirmed",
     "coverage",
     "classes",
@@ -59,6 +60,7 @@ class Evidence:
     explained: float  # of the keyframes' points that should be seen, those that are inliers
     query_share: float  # of the query's keypoints, those that are inliers
     aligned: float  # of the inlier pairs, those whose patches are alike to the pixel
+    likeness: float  # of the best keyframe's points about inliers, those whose patches look alike in the query
     confirmed: float  # of the keyframes' points that fall on a keypoint of the query, those that look like it
     coverage: float  # of the cells in which keyframes' points should be seen (at least four), those that hold inliers
     classes: float  # of the objects' points that should be seen, those that lie on an object of their class
@@ -95,6 +97,7 @@ def gather_evidence(
     order = np.argsort(-pairs, kind="stable")
     supporters = [int(n) for n in order if pairs[n] >= SUPPORTER_PAIRS] or [int(order[0])]
     explained, confirmed, coverage, classes, class_points = _what_should_be_seen(query, keyframes, estimate, supporters)
+    likeness = _likeness(query, keyframes[supporters[0]], estimate)
     known = np.asarray(cosines, float)
     best = known[supporters]
     others = np.delete(known, supporters)
@@ -116,6 +119,7 @@ def gather_evidence(
         explained=explained,
         query_share=estimate.inliers / max(len(query), 1),
         aligned=NEUTRAL if query.grey is None else min(estimate.aligned / max(len(estimate.pairs), 1), 1.0),
+        likeness=NEUTRAL if likeness is None else likeness,
         confirmed=confirmed,
         coverage=coverage,
         classes=classes,
@@ -133,7 +137,6 @@ def _what_should_be_seen(
     Under a right pose most of what the keyframes hold is there again; under a wrong one that a single repeated thing
     supports, the rest is missing. In a room of the same shapes the points fall on keypoints that look otherwise.
     """
-    camera_from_world = invert_pose(estimate.world_from_camera)
     size = np.array([query.camera.width, query.camera.height], float)
     tree = cKDTree(query.seen_xy) if len(query) else None
     seen = agreeing = coincident = 0
@@ -141,17 +144,14 @@ def _what_should_be_seen(
     same = compared = 0
     for slot in supporters:
         keyframe = keyframes[slot]
-        local = transform_points(camera_from_world, keyframe.world_points)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            pixels = np.asarray(project(query.camera, local))
-        inside = (local[:, 2] > 0.1) & (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1)
-        seen += int(inside.sum())
+        inside, pixels = _seen_points(query, keyframe, estimate)
+        seen += len(inside)
         agreeing += estimate.per_keyframe[slot]
-        cells = (pixels[inside] * GRID / size).astype(int)
+        cells = (pixels * GRID / size).astype(int)
         expected += np.bincount(cells[:, 1] * GRID + cells[:, 0], minlength=GRID * GRID)
         if tree is None:
             continue
-        distance, nearest = tree.query(pixels[inside], distance_upper_bound=NEAR_PX)
+        distance, nearest = tree.query(pixels, distance_upper_bound=NEAR_PX)
         coincident += int(np.count_nonzero(distance < SAME_PX))
         if (query.classes >= 0).any():
             near = np.isfinite(distance)
@@ -165,6 +165,26 @@ def _what_should_be_seen(
     coverage = float((shown & held).sum() / max(shown.sum(), LEAST_CELLS))
     classes = same / compared if compared >= LEAST_OBJECT_POINTS else NEUTRAL
     return explained, confirmed, coverage, classes, compared
+
+
+def _likeness(query: View, keyframe: KeyframeView, estimate: PoseEstimate) -> float | None:
+    """`Evidence.likeness`: among the points that fall into cells of the image that hold inliers."""
+    rows, pixels = _seen_points(query, keyframe, estimate)
+    size = np.array([query.camera.width, query.camera.height], float)
+    held = _cells_of(query.seen_xy[estimate.pairs.query], size)
+    cells = (pixels * GRID / size).astype(int)
+    about = held[cells[:, 1] * GRID + cells[:, 0]]
+    return likeness_share(query, keyframe, estimate.world_from_camera, rows[about], pixels[about])
+
+
+def _seen_points(query: View, keyframe: KeyframeView, estimate: PoseEstimate) -> tuple[IntArray, FloatArray]:
+    """Which of the keyframe's points the pose puts into the query's image, and where ``[n, 2]``, pixels as seen."""
+    local = transform_points(invert_pose(estimate.world_from_camera), keyframe.world_points)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pixels = np.asarray(project(query.camera, local))
+    size = np.array([query.camera.width, query.camera.height], float)
+    rows = np.flatnonzero((local[:, 2] > 0.1) & (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1))
+    return rows.astype(np.int32), pixels[rows]
 
 
 def _cells_of(pixels: Float32Array, size: FloatArray) -> BoolArray:
@@ -186,7 +206,7 @@ def confidence_features(evidence: Evidence) -> FloatArray:
             evidence.spread,
             np.log(max(evidence.explained, 0.003)),
             np.log(max(evidence.query_share, 0.003)),
-            evidence.aligned,
+            evidence.likeness,
             evidence.confirmed,
             evidence.coverage,
             evidence.classes,

@@ -41,6 +41,7 @@ EVIDENCE = Evidence(
     explained=0.4,
     query_share=0.15,
     aligned=0.8,
+    likeness=0.8,
     confirmed=0.8,
     coverage=0.9,
     classes=0.8,
