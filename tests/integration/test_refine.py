@@ -21,7 +21,6 @@ from semdb.types import Description, ObjectGeometry
 from tests.database_samples import MODELS, description, plan, pose, record
 
 
-
 def refine_map(store: Store, info: MapInfo, *, force: bool = False) -> list[StepResult]:
     """The step of classes alone."""
     return refine.refine_map(store, info, kinds=[CLASSES], force=force)
