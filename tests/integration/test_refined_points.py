@@ -1,0 +1,154 @@
+"""Refined points on both servers: what is written, when it is used; order of ingest and server do not matter."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sqlalchemy import text
+
+from semdb.database import point_rows
+from semdb.database.codecs import encode_array
+from semdb.database.records import KeyframePoints, KeyframeRecord, MapInfo
+from semdb.database.store import Store, open_store
+from semdb.errors import CodecError
+from semdb.geometry import pose_from, so3_exp
+from semdb.localization.keyframe_cache import KeyframeCache
+from semdb.localization.localizer import LocalizerOptions
+from semdb.localize import make_localizer
+from semdb.refine import POINTS, refine_map
+from semdb.types import Description, FloatArray, Keypoints
+from tests.database_samples import MODELS, description, plan, record
+from tests.unit.localization_scene import CAMERA, Scene
+
+FRAMES = 6
+CATEGORIES = ["chair", "cup", "tv"]
+
+
+def pose_of(frame: float) -> FloatArray:
+    return pose_from(so3_exp([0, 0.06 * (frame - 3), 0]), [0.25 * (frame - 3), 0.1 * (frame % 2), 0.0])
+
+
+def described(scene: Scene, frame: float, hidden: float) -> tuple[Description, Keypoints]:
+    """A view of the scene, a share of its keypoints without depth; and what is true."""
+    truth = scene.keypoints(pose_of(frame))
+    points = truth.points.copy()
+    points[scene.random.random(len(points)) < hidden] = np.nan
+    made = description(int(frame * 2), CATEGORIES, camera=CAMERA)
+    return replace(made, keypoints=replace(truth, points=points)), truth
+
+
+@pytest.fixture(scope="module")
+def views() -> tuple[list[KeyframeRecord], list[Keypoints], Description]:
+    """Keyframes of one scene, their true keypoints, and a query with its image between two of them."""
+    scene = Scene(2, 250)
+    made = [described(scene, frame, 0.4) for frame in range(FRAMES)]
+    records = [replace(record(n, view), world_from_camera=pose_of(n)) for n, (view, _) in enumerate(made)]
+    return records, [truth for _, truth in made], described(scene, 2.5, 1.0)[0]
+
+
+def ingest(store: Store, name: str, records: Sequence[KeyframeRecord], order: Sequence[int]) -> tuple[MapInfo, int]:
+    map_id = store.ensure_map(name)
+    planned = store.plan_recording(map_id, plan("walk", range(FRAMES)), MODELS)
+    for index in order:
+        store.write_keyframe(planned.recording_id, records[index])
+    return store.find_map(name), planned.recording_id
+
+
+def by_frame(store: Store, info: MapInfo) -> dict[int, bytes]:
+    listed = store.listed_keyframes(info.id)
+    points = store.refined_points([item.id for item in listed])
+    return {item.frame_index: points[item.id].tobytes() for item in listed if item.id in points}
+
+
+def test_points_that_are_missing_are_found(store: Store, views: tuple[list[KeyframeRecord], ...]) -> None:
+    records, truths, query = views
+    info, _ = ingest(store, "room", records, range(FRAMES))
+    told: list[tuple[str, int, int]] = []
+    (result,) = refine_map(store, info, kinds=[POINTS], progress=lambda *at: told.append(at))
+    assert (result.kind, result.rows, result.computed, result.current) == (POINTS, FRAMES, True, True)
+    assert told[-1][1:] == (2 * FRAMES, 2 * FRAMES)
+    errors = []
+    for listed, truth in zip(store.listed_keyframes(info.id), truths, strict=True):
+        found = store.refined_points([listed.id])[listed.id]
+        assert found.shape == (len(truth), 4)
+        measured = store.load_keyframes([listed.id])[0].keypoints.points
+        missing = np.isnan(measured[:, 2]) & np.isfinite(found[:, 2])
+        errors += np.linalg.norm(found[missing, :3] - truth.points[missing], axis=1).tolist()
+        with store.engine.connect() as connection:
+            row = connection.execute(
+                text("SELECT count, fused, triangulated FROM refined_points WHERE keyframe_id = :id"), {"id": listed.id}
+            ).one()
+        assert tuple(row) == (len(truth), int((np.isfinite(found[:, 2]) & ~missing).sum()), int(missing.sum()))
+    assert len(errors) > 200
+    assert np.median(errors) < 0.005
+    with_points = make_localizer(store, info, "sql").localize(query)
+    without = make_localizer(store, info, "sql", LocalizerOptions(refined_points=False)).localize(query)
+    assert (with_points.refinements, without.refinements) == ({"points": "used"}, {"points": "off"})
+    assert with_points.inliers > 1.2 * without.inliers
+
+
+def test_order_of_ingest_and_server_do_not_matter(
+    store: Store, views: tuple[list[KeyframeRecord], ...], tmp_path: Path
+) -> None:
+    first, _ = ingest(store, "first", views[0], range(FRAMES))
+    second, _ = ingest(store, "second", views[0], [4, 1, 5, 0, 3, 2])
+    with open_store(f"sqlite:///{tmp_path / 'other.sqlite3'}", create=True) as other:
+        third, _ = ingest(other, "third", views[0], [5, 3, 1, 4, 2, 0])
+        found = []
+        for where, info in ((store, first), (store, second), (other, third)):
+            refine_map(where, info, kinds=[POINTS])
+            found.append(by_frame(where, info))
+    assert len(found[0]) == FRAMES
+    assert found[0] == found[1] == found[2]
+
+
+def test_stale_points_are_not_used(store: Store, views: tuple[list[KeyframeRecord], ...]) -> None:
+    records, _, query = views
+    info, recording_id = ingest(store, "room", records, range(FRAMES - 1))
+    said: list[str] = []
+    localizer = make_localizer(store, info, "sql", say=said.append)
+    assert localizer.localize(query).refinements == {"points": "none"}
+    assert said == []
+    refine_map(store, info)
+    localizer = make_localizer(store, info, "sql")
+    before = localizer.localize(query)
+    assert before.refinements == {"points": "used"}
+    store.write_keyframe(recording_id, records[FRAMES - 1])
+    after = localizer.localize(query)  # the one that is open notices, and so does a new one
+    assert after.refinements == {"points": "stale"}
+    assert after.inliers < before.inliers
+    fresh = make_localizer(store, info, "sql", say=said.append)
+    assert "not used: run semdb refine" in said[-1]
+    assert fresh.localize(query).inliers == after.inliers
+    refine_map(store, info)
+    ids, _ = store.poses(info.id)
+    store.delete_keyframes(ids[:1])  # its row goes with it
+    assert set(by_frame(store, info)) == set(range(1, FRAMES))
+    assert make_localizer(store, info, "sql").localize(query).refinements == {"points": "stale"}
+    (result,) = refine_map(store, info, kinds=[POINTS])
+    assert (result.rows, result.computed) == (FRAMES - 1, True)
+    assert make_localizer(store, info, "sql").localize(query).refinements == {"points": "used"}
+    store.delete_map(info.id)
+    with store.engine.connect() as connection:
+        assert connection.execute(text("SELECT COUNT(*) FROM refined_points")).scalar_one() == 0
+
+
+def test_rows_that_cannot_be_right_are_refused(store: Store, views: tuple[list[KeyframeRecord], ...]) -> None:
+    info, _ = ingest(store, "room", views[0], range(2))
+    refine_map(store, info, kinds=[POINTS])
+    (first, second) = (item.id for item in store.listed_keyframes(info.id))
+    short = KeyframePoints(first, np.zeros((3, 4), np.float32), 3, 0)
+    with store.engine.begin() as connection:
+        assert point_rows.replace_points(connection, info.id, [short]) == 1
+    with pytest.raises(CodecError, match="3 points for"):
+        KeyframeCache(store, info.id).views([first])
+    assert len(KeyframeCache(store, info.id).views([second])) == 1  # without a row it keeps what was measured
+    with store.engine.begin() as connection:
+        blob = encode_array(np.zeros((3, 2), np.float32))
+        connection.execute(text("UPDATE refined_points SET data = :data"), {"data": blob})
+    with pytest.raises(CodecError, match="float32"):
+        store.refined_points([first])
