@@ -50,11 +50,13 @@ def bundle_adjust(
     camera_from_world: FloatArray,
     options: PoseOptions,
     alignment: Alignment | None = None,
+    start: BundleResult | None = None,
 ) -> BundleResult:
     """Equation (5) over the agreeing pairs, whose `points` ``[n, 3]`` are a first guess in the world.
 
     Pairs of one query keypoint with several keyframes are one point, but for those that `alignment` found: each of
-    these is the point of its keyframe's keypoint. Without an alignment the result is a rough one.
+    these is the point of its keyframe's keypoint. Without an alignment the result is a rough one, from which the next
+    may `start`.
     Raises numpy.linalg.LinAlgError where the pairs do not determine the pose.
     """
     aligned = np.zeros(len(pairs), np.bool_) if alignment is None else alignment.found
@@ -84,7 +86,7 @@ def bundle_adjust(
         rows=observed[:, 4],
         keyframe_from_world=np.stack([keyframe.camera_from_world for keyframe in keyframes]),
     )
-    return adjust(problem, camera_from_world, options.motion, rough=alignment is None)
+    return adjust(problem, camera_from_world, options.motion, rough=alignment is None, start=start)
 
 
 def _observations(

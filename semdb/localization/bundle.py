@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semdb.geometry import so3_exp
 from semdb.types import Float32Array, FloatArray, IntArray
 
 CAUCHY_SQUARED = 4.0  # (2 sigma)^2: where the loss leaves the parabola
@@ -58,7 +57,7 @@ class BundleProblem:
 
     points: FloatArray  # [m, 3] world, first guess
     observed_point: IntArray  # [k] ascending
-    observed_image: IntArray  # [k]
+    observed_image: IntArray  # [k] of each point, ascending
     xy: FloatArray  # [k, 2]
     sigma: FloatArray  # [k]
     depth: FloatArray  # [k] metres, NaN where there is none
@@ -75,9 +74,10 @@ class BundleResult:
 
     camera_from_world: FloatArray  # [4, 4]
     points: FloatArray  # [m, 3]
-    covariance: FloatArray  # [6, 6]
+    covariance: FloatArray | None  # [6, 6]; None of a rough solution
     image_from_world: FloatArray  # [c, 4, 4]
     turn: FloatArray  # [c, 3]
+    shift: FloatArray  # [c, 6] steps that the images have made from their start
     chi2: FloatArray  # [k] squared pixel residual over its variance
     iterations: int
 
@@ -173,7 +173,7 @@ class _Solver:
 
     def moved(self, state: _State, blocks: _Blocks, damping: float) -> tuple[_State, FloatArray]:
         """The state after one step, and the step ``[c, 9]``."""
-        from semdb.localization.bundle_kernels import move_points
+        from semdb.localization.bundle_kernels import move_images, move_points
 
         matrix, gradient = self.reduced(blocks, damping)
         step = np.asarray(-np.linalg.solve(matrix, gradient), np.float64).reshape(-1, 9)
@@ -181,8 +181,7 @@ class _Solver:
             state.points, blocks.coupling, blocks.points, blocks.point_gradients, self.first,
             self.problem.observed_image, damping, step,
         )  # fmt: skip
-        poses = np.stack([_move(pose, one) for pose, one in zip(state.poses, step, strict=True)])
-        return _State(poses, state.turn + step[:, 6:], state.shift + step[:, :6], points), step
+        return _State(move_images(state.poses, step), state.turn + step[:, 6:], state.shift + step[:, :6], points), step
 
     def minimise(self, state: _State, max_iterations: int) -> tuple[_State, _Blocks, int]:
         blocks, damping, iteration = self.linearise(state), 1e-4, 0
@@ -208,14 +207,6 @@ def _depth_sigma(depth: FloatArray) -> FloatArray:
     return np.asarray(depth_sigma(depth))  # type: ignore[arg-type]  # compiled: takes arrays too
 
 
-def _move(pose: FloatArray, step: FloatArray) -> FloatArray:
-    rotation = so3_exp(step[3:6])
-    moved = np.eye(4)
-    moved[:3, :3] = rotation @ pose[:3, :3]
-    moved[:3, 3] = rotation @ pose[:3, 3] + step[:3]
-    return moved
-
-
 def adjust(
     problem: BundleProblem,
     camera_from_world: FloatArray,
@@ -223,13 +214,15 @@ def adjust(
     max_iterations: int = 15,
     *,
     rough: bool = False,
+    start: BundleResult | None = None,
 ) -> BundleResult:
-    """Minimises equation (5) from `camera_from_world` ``[4, 4]``.
+    """Minimises equation (5) from `camera_from_world` ``[4, 4]``, or from where `start` left the same images.
 
     It is solved twice. First the images may turn and the keyframes move as far as `prior` believes at most; then
     the variance of each of these priors is what the solution shows it to be (MacKay's evidence approximation, Neural
     Computation 4(3), 1992). So where nothing turned, no freedom is given that noise would use.
-    The query's depth joins the second time, as far as it agrees with the first solution. `rough` stops after the first.
+    The query's depth joins the second time, as far as it agrees with the first solution. `rough` stops after the first,
+    without a covariance.
     Raises numpy.linalg.LinAlgError when the points do not determine the pose (fewer than three, or in a row).
     """
     prior = prior or MotionPrior()
@@ -237,22 +230,32 @@ def adjust(
     count = solver.images
     poses = np.concatenate([camera_from_world[None], problem.keyframe_from_world])
     state = _State(poses, np.zeros((count, 3)), np.zeros((count, 6)), problem.points)
+    if start is not None:
+        state = _State(start.image_from_world, start.turn, start.shift, problem.points)
     greatest = np.array([prior.keyframe_m, prior.keyframe_rad, prior.turn_rad])
     least = np.minimum(greatest, [prior.least_keyframe_m, prior.least_keyframe_rad, prior.least_turn_rad])
     solver.information = _information(greatest, count)
     solver.observed[problem.observed_image == QUERY, 5] = IGNORED
     state, blocks, iterations = solver.minimise(state, FIRST_ITERATIONS)
     if rough:
-        return _result(solver, state, blocks, iterations)
+        return _result(state, blocks, iterations, None)
     solver.believe_depth(state)
     solver.information = _information(_evident_sigma(solver, state, blocks, least, greatest), count)
     state, blocks, more = solver.minimise(state, max_iterations)
-    return _result(solver, state, blocks, iterations + more)
+    return _result(state, blocks, iterations + more, _covariance(solver, blocks, state.poses[QUERY]))
 
 
-def _result(solver: _Solver, state: _State, blocks: _Blocks, iterations: int) -> BundleResult:
-    covariance = _covariance(solver, blocks, state.poses[QUERY])
-    return BundleResult(state.poses[QUERY], state.points, covariance, state.poses, state.turn, blocks.chi2, iterations)
+def _result(state: _State, blocks: _Blocks, iterations: int, covariance: FloatArray | None) -> BundleResult:
+    return BundleResult(
+        camera_from_world=state.poses[QUERY],
+        points=state.points,
+        covariance=covariance,
+        image_from_world=state.poses,
+        turn=state.turn,
+        shift=state.shift,
+        chi2=blocks.chi2,
+        iterations=iterations,
+    )
 
 
 def _information(sigma: FloatArray, images: int) -> FloatArray:

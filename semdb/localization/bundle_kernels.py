@@ -14,6 +14,11 @@ from semdb.compiled import kernel
 from semdb.types import FloatArray, IntArray
 
 PARAMETERS = 9  # of an image
+WIDTH = 12  # of a row of residuals with its Jacobian: 9 parameters, the residual, and room to whole vector registers
+RESIDUAL = 9  # where the residual is in it
+GREAT = 1e60  # a product greater than that is not to grow on
+# sums may be taken in another order, for vector instructions; what is no number stays none
+FAST = {"reassoc", "contract", "nsz", "arcp"}
 
 
 @kernel
@@ -25,58 +30,85 @@ def depth_sigma(depth: float) -> float:
     return 0.0012 + 0.0019 * (depth - 0.4) ** 2
 
 
-@kernel
+@kernel(fastmath=FAST, forceinline=True)
 def _observe(
-    x: float,
-    y: float,
-    z: float,
-    u: float,
-    v: float,
-    sigma: float,
-    depth: float,
-    looser: float,
+    points: FloatArray,
+    n: int,
+    rotation: FloatArray,
+    translation: FloatArray,
+    turn: FloatArray,
+    c: int,
+    observed: FloatArray,
+    k: int,
     cauchy: float,
-    out: FloatArray,
-) -> float:
-    """Weighted residuals (out[0, :]) and their Jacobian by the camera-frame point (out[1:4, :], one row each).
+    rows: FloatArray,
+    by_point: FloatArray,
+) -> tuple[float, float]:
+    """Weighted residuals of observation `k`, of point `n` in image `c`. Whole arrays: to cut them costs more.
 
-    Returns the robust cost; out[4, 0] is the squared pixel residual over its variance.
+    Fills `rows` ``[3, 12]`` (Jacobian by the image's parameters, residual) and `by_point` ``[3, 4]`` (Jacobian by the
+    world point); the third row, of the depth, is zero where there is none. Returns the squared pixel residual over its
+    variance, and what the robust cost grows by, as the argument of a logarithm.
     """
-    z = max(z, 1e-3)
-    inverse = 1.0 / (z * sigma)
-    rx, ry = (x / z - u) / sigma, (y / z - v) / sigma
+    sigma, depth, row = observed[k, 2], observed[k, 3], observed[k, 4]
+    x = (
+        rotation[c, 0, 0] * points[n, 0]
+        + rotation[c, 0, 1] * points[n, 1]
+        + rotation[c, 0, 2] * points[n, 2]
+        + translation[c, 0]
+    )
+    y = (
+        rotation[c, 1, 0] * points[n, 0]
+        + rotation[c, 1, 1] * points[n, 1]
+        + rotation[c, 1, 2] * points[n, 2]
+        + translation[c, 1]
+    )
+    z = (
+        rotation[c, 2, 0] * points[n, 0]
+        + rotation[c, 2, 1] * points[n, 1]
+        + rotation[c, 2, 2] * points[n, 2]
+        + translation[c, 2]
+    )
+    wx, wy, wz = (
+        row * turn[c, 0],
+        row * turn[c, 1],
+        row * turn[c, 2],
+    )  # to first order, the camera turned by that in this row
+    ahead = max(z + wx * y - wy * x, 1e-3)
+    u, v = (x + wy * z - wz * y) / ahead, (y + wz * x - wx * z) / ahead
+    rx, ry = (u - observed[k, 0]) / sigma, (v - observed[k, 1]) / sigma
     chi2 = rx * rx + ry * ry
-    weight = 1.0 / np.sqrt(1.0 + chi2 / cauchy)
-    out[:] = 0.0
-    out[0, 0], out[0, 1] = rx * weight, ry * weight
-    out[1, 0], out[1, 2] = inverse * weight, -x / z * inverse * weight
-    out[2, 1], out[2, 2] = inverse * weight, -y / z * inverse * weight
-    out[4, 0] = chi2
-    cost: float = cauchy * np.log1p(chi2 / cauchy)
-    if not np.isnan(depth):
-        spread = depth_sigma(depth) * looser
-        rz = (z - depth) / spread
-        depth_weight = 1.0 / np.sqrt(1.0 + rz * rz / cauchy)
-        out[0, 2] = rz * depth_weight
-        out[3, 2] = depth_weight / spread
-        cost += cauchy * np.log1p(rz * rz / cauchy)
-    return cost
+    growth = 1.0 + chi2 / cauchy
+    weight = 1.0 / np.sqrt(growth)
+    scale = weight / (ahead * sigma)
+    for r in range(3):
+        # Jacobian by the point as seen: (p, q, s)
+        if r == 0:
+            p, q, s, residual = scale, 0.0, -u * scale, rx * weight
+        elif r == 1:
+            p, q, s, residual = 0.0, scale, -v * scale, ry * weight
+        elif np.isnan(depth):
+            p, q, s, residual = 0.0, 0.0, 0.0, 0.0
+        else:
+            spread = depth_sigma(depth) * observed[k, 5]
+            rz = (ahead - depth) / spread
+            growth_of_depth = 1.0 + rz * rz / cauchy
+            growth *= growth_of_depth
+            weight = 1.0 / np.sqrt(growth_of_depth)
+            p, q, s, residual = 0.0, 0.0, weight / spread, rz * weight
+        # through the turn of the readout, I + row [w]x, then through the pose
+        a, b, d = p + q * wz - s * wy, q + s * wx - p * wz, s + p * wy - q * wx
+        # the point turns with the camera by w x p, so row (a, b, d) becomes p x (a, b, d)
+        rows[r, 0], rows[r, 1], rows[r, 2] = a, b, d
+        rows[r, 3], rows[r, 4], rows[r, 5] = y * d - z * b, z * a - x * d, x * b - y * a
+        rows[r, 6], rows[r, 7], rows[r, 8] = row * (y * s - z * q), row * (z * p - x * s), row * (x * q - y * p)
+        rows[r, RESIDUAL] = residual
+        for j in range(3):
+            by_point[r, j] = a * rotation[c, 0, j] + b * rotation[c, 1, j] + d * rotation[c, 2, j]
+    return chi2, growth
 
 
-@kernel
-def _in_camera(
-    point: FloatArray, rotation: FloatArray, translation: FloatArray, turn: FloatArray, row: float, out: FloatArray
-) -> None:
-    """The point in the camera (out[0]) and as seen in `row` (out[1]): turned by ``turn * row``, to first order."""
-    for i in range(3):
-        out[0, i] = rotation[i, 0] * point[0] + rotation[i, 1] * point[1] + rotation[i, 2] * point[2] + translation[i]
-    x, y, z = out[0, 0], out[0, 1], out[0, 2]
-    out[1, 0] = x + row * (turn[1] * z - turn[2] * y)
-    out[1, 1] = y + row * (turn[2] * x - turn[0] * z)
-    out[1, 2] = z + row * (turn[0] * y - turn[1] * x)
-
-
-@kernel
+@kernel(fastmath=FAST)
 def normal_equations(
     points: FloatArray,
     rotation: FloatArray,
@@ -100,78 +132,50 @@ def normal_equations(
     `observed` ``[k, 6]`` is (x, y, sigma, depth, row, factor of the depth's noise). Filled: ``[c, 9, 9]``, ``[c, 9]``,
     ``[k, 9, 3]``, ``[m, 3, 3]``, ``[m, 3]``, ``[k]``, and ``[k, 9]``: what each observation adds to the gradients.
     """
-    image_blocks[:] = 0.0
-    image_gradients[:] = 0.0
     point_blocks[:] = 0.0
     point_gradients[:] = 0.0
-    out = np.empty((5, 3))
-    local = np.empty((2, 3))
-    by_point = np.empty((3, 3))
-    by_image = np.empty((3, PARAMETERS))
-    cost = 0.0
+    sums = np.zeros((len(image_blocks), PARAMETERS, WIDTH))
+    rows, by_point = np.zeros((3, WIDTH)), np.zeros((3, 4))
+    cost, product = 0.0, 1.0  # one logarithm of many factors
     for k in range(len(observed)):
         n, c = observed_point[k], observed_image[k]
-        row = observed[k, 4]
-        pose, w = rotation[c], turn[c]
-        _in_camera(points[n], pose, translation[c], w, row, local)
-        x, y, z = local[0, 0], local[0, 1], local[0, 2]
-        cost += _observe(
-            local[1, 0], local[1, 1], local[1, 2],
-            observed[k, 0], observed[k, 1], observed[k, 2], observed[k, 3], observed[k, 5], cauchy, out,
-        )  # fmt: skip
-        chi2[k] = out[4, 0]
-        for r in range(3):
-            p, q, s = out[r + 1, 0], out[r + 1, 1], out[r + 1, 2]
-            # through the turn of the readout, I + row [w]x, then through the pose
-            a = p + row * (q * w[2] - s * w[1])
-            b = q + row * (s * w[0] - p * w[2])
-            d = s + row * (p * w[1] - q * w[0])
-            by_image[r, 0], by_image[r, 1], by_image[r, 2] = a, b, d
-            # the point turns with the camera by w x p, so row (a, b, d) becomes p x (a, b, d)
-            by_image[r, 3], by_image[r, 4], by_image[r, 5] = y * d - z * b, z * a - x * d, x * b - y * a
-            by_image[r, 6], by_image[r, 7], by_image[r, 8] = (
-                row * (y * s - z * q), row * (z * p - x * s), row * (x * q - y * p),
-            )  # fmt: skip
-            for j in range(3):
-                by_point[r, j] = a * pose[0, j] + b * pose[1, j] + d * pose[2, j]
-        _add(by_image, by_point, out, image_blocks[c], image_gradients[c], coupling[k], own_gradients[k])
-        _add_point(by_point, out, point_blocks[n], point_gradients[n])
+        chi2[k], growth = _observe(points, n, rotation, translation, turn, c, observed, k, cauchy, rows, by_point)
+        product *= growth
+        if product > GREAT:
+            cost += np.log(product)
+            product = 1.0
+        _add(rows, by_point, sums, c, coupling, own_gradients, k)
+        _add_point(rows, by_point, point_blocks, point_gradients, n)
     for c in range(len(image_blocks)):
         for i in range(PARAMETERS):
-            for j in range(i):
-                image_blocks[c, i, j] = image_blocks[c, j, i]
-    return cost
+            image_gradients[c, i] = sums[c, i, RESIDUAL]
+            for j in range(PARAMETERS):
+                image_blocks[c, i, j] = sums[c, i, j]
+    total: float = cauchy * (cost + np.log(product))
+    return total
 
 
-@kernel
+@kernel(fastmath=FAST, forceinline=True)
 def _add(
-    by_image: FloatArray,
-    by_point: FloatArray,
-    out: FloatArray,
-    block: FloatArray,
-    gradient: FloatArray,
-    coupling: FloatArray,
-    own: FloatArray,
+    rows: FloatArray, by_point: FloatArray, sums: FloatArray, c: int, coupling: FloatArray, own: FloatArray, k: int
 ) -> None:
-    """Adds one observation to its image (upper triangle of `block`), and fills what couples image and point."""
+    """Adds observation `k` to the sums ``[9, 12]`` of its image `c`, and fills what couples image and point."""
     for i in range(PARAMETERS):
-        a, b, c = by_image[0, i], by_image[1, i], by_image[2, i]
-        own[i] = a * out[0, 0] + b * out[0, 1] + c * out[0, 2]
-        gradient[i] += own[i]
-        for j in range(i, PARAMETERS):
-            block[i, j] += a * by_image[0, j] + b * by_image[1, j] + c * by_image[2, j]
+        p, q, s = rows[0, i], rows[1, i], rows[2, i]
+        for j in range(WIDTH):
+            sums[c, i, j] += p * rows[0, j] + q * rows[1, j] + s * rows[2, j]
         for j in range(3):
-            coupling[i, j] = a * by_point[0, j] + b * by_point[1, j] + c * by_point[2, j]
+            coupling[k, i, j] = p * by_point[0, j] + q * by_point[1, j] + s * by_point[2, j]
+        own[k, i] = p * rows[0, RESIDUAL] + q * rows[1, RESIDUAL] + s * rows[2, RESIDUAL]
 
 
-@kernel
-def _add_point(by_point: FloatArray, out: FloatArray, block: FloatArray, gradient: FloatArray) -> None:
+@kernel(fastmath=FAST, forceinline=True)
+def _add_point(rows: FloatArray, by_point: FloatArray, blocks: FloatArray, gradients: FloatArray, n: int) -> None:
     for i in range(3):
-        gradient[i] += by_point[0, i] * out[0, 0] + by_point[1, i] * out[0, 1] + by_point[2, i] * out[0, 2]
+        p, q, s = by_point[0, i], by_point[1, i], by_point[2, i]
+        gradients[n, i] += p * rows[0, RESIDUAL] + q * rows[1, RESIDUAL] + s * rows[2, RESIDUAL]
         for j in range(3):
-            block[i, j] += (
-                by_point[0, i] * by_point[0, j] + by_point[1, i] * by_point[1, j] + by_point[2, i] * by_point[2, j]
-            )
+            blocks[n, i, j] += p * by_point[0, j] + q * by_point[1, j] + s * by_point[2, j]
 
 
 @kernel
@@ -187,7 +191,7 @@ def invert_3x3(block: FloatArray, damping: float, inverse: FloatArray) -> None:
     inverse[2, 0], inverse[2, 1], inverse[2, 2] = m02 * scale, (b * c - a * e) * scale, (a * d - b * b) * scale
 
 
-@kernel
+@kernel(fastmath=FAST)
 def reduce_to_images(
     coupling: FloatArray,
     point_blocks: FloatArray,
@@ -200,29 +204,61 @@ def reduce_to_images(
 ) -> None:
     """Subtracts from `reduced` ``[9c, 9c]`` and `gradient` ``[9c]`` what the points account for (Schur complement).
 
-    The observations of point n are ``first[n]`` to ``first[n + 1]``.
+    The observations of point n are ``first[n]`` to ``first[n + 1]``, each of another image, in the order of the images.
     """
     inverse = np.empty((3, 3))
     carried = np.empty((PARAMETERS, 3))
     for n in range(len(point_blocks)):
         invert_3x3(point_blocks[n], damping, inverse)
         for k in range(first[n], first[n + 1]):
+            own = coupling[k]
             one = PARAMETERS * observed_image[k]
             for i in range(PARAMETERS):
-                a, b, c = coupling[k, i, 0], coupling[k, i, 1], coupling[k, i, 2]
-                total = 0.0
+                a, b, c = own[i, 0], own[i, 1], own[i, 2]
                 for j in range(3):
                     carried[i, j] = a * inverse[0, j] + b * inverse[1, j] + c * inverse[2, j]
-                    total += carried[i, j] * point_gradients[n, j]
-                gradient[one + i] -= total
-            for other in range(first[n], first[n + 1]):
+                gradient[one + i] -= (
+                    carried[i, 0] * point_gradients[n, 0]
+                    + carried[i, 1] * point_gradients[n, 1]
+                    + carried[i, 2] * point_gradients[n, 2]
+                )
+                for j in range(i + 1):
+                    reduced[one + j, one + i] -= carried[j, 0] * a + carried[j, 1] * b + carried[j, 2] * c
+            for other in range(k + 1, first[n + 1]):
                 two = PARAMETERS * observed_image[other]
+                there = coupling[other]
                 for i in range(PARAMETERS):
                     a, b, c = carried[i, 0], carried[i, 1], carried[i, 2]
+                    line = reduced[one + i]
                     for j in range(PARAMETERS):
-                        reduced[one + i, two + j] -= (
-                            a * coupling[other, j, 0] + b * coupling[other, j, 1] + c * coupling[other, j, 2]
-                        )
+                        line[two + j] -= a * there[j, 0] + b * there[j, 1] + c * there[j, 2]
+    for i in range(len(reduced)):
+        for j in range(i):
+            reduced[i, j] = reduced[j, i]
+
+
+@kernel
+def move_images(poses: FloatArray, step: FloatArray) -> FloatArray:
+    """Poses ``[c, 4, 4]`` after the steps ``[c, 9]``: turned by the exponential of ``step[3:6]``, then shifted."""
+    moved = np.zeros_like(poses)
+    turn = np.empty((3, 3))
+    for c in range(len(poses)):
+        x, y, z = step[c, 3], step[c, 4], step[c, 5]
+        square = x * x + y * y + z * z
+        angle = np.sqrt(square)
+        sine = np.sin(angle) / angle if angle > 1e-8 else 1.0
+        half = (1.0 - np.cos(angle)) / square if angle > 1e-4 else 0.5 - square / 24
+        turn[0, 0], turn[1, 1] = 1 - half * (y * y + z * z), 1 - half * (x * x + z * z)
+        turn[2, 2] = 1 - half * (x * x + y * y)
+        turn[0, 1], turn[1, 0] = half * x * y - sine * z, half * x * y + sine * z
+        turn[0, 2], turn[2, 0] = half * x * z + sine * y, half * x * z - sine * y
+        turn[1, 2], turn[2, 1] = half * y * z - sine * x, half * y * z + sine * x
+        for i in range(3):
+            for j in range(4):
+                moved[c, i, j] = turn[i, 0] * poses[c, 0, j] + turn[i, 1] * poses[c, 1, j] + turn[i, 2] * poses[c, 2, j]
+            moved[c, i, 3] += step[c, i]
+        moved[c, 3, 3] = 1.0
+    return moved
 
 
 @kernel

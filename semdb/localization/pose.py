@@ -317,7 +317,8 @@ def _refine(
         raise np.linalg.LinAlgError("too few pairs are left")
     used, points = pairs.take(agreeing), world_points_of(pairs, keyframes)[agreeing]
     alignment = align_pairs(query, keyframes, used.query, used.slot, used.keypoint, adjusted)
-    adjusted = bundle_adjust(query, keyframes, used, points, adjusted.camera_from_world, options, alignment)
+    pose = adjusted.camera_from_world
+    adjusted = bundle_adjust(query, keyframes, used, points, pose, options, alignment, start=adjusted)
     aligned = int(np.count_nonzero(alignment.found))
     return pairs, adjusted_error_px(query, keyframes, pairs, adjusted), adjusted, aligned
 
