@@ -102,13 +102,6 @@ def slerp_wxyz(first: FloatArray, second: FloatArray, fraction: float) -> FloatA
     return result
 
 
-def interpolate_pose(first: FloatArray, second: FloatArray, fraction: float) -> FloatArray:
-    """The pose at `fraction` 0..1 between two ``[4, 4]`` poses: slerp of rotation, linear translation."""
-    quaternion = slerp_wxyz(quat_wxyz_from_rotation(first[:3, :3]), quat_wxyz_from_rotation(second[:3, :3]), fraction)
-    translation = (1 - fraction) * first[:3, 3] + fraction * second[:3, 3]
-    return pose_from(rotation_from_quat_wxyz(quaternion), translation)
-
-
 def skew(v: FloatArray) -> FloatArray:
     """``skew(v) @ u == cross(v, u)``."""
     return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
@@ -215,11 +208,3 @@ def back_project(camera: Camera, pixels: npt.ArrayLike, depth: npt.ArrayLike) ->
     """Camera-frame points ``[n, 3]`` of `pixels` ``[n, 2]`` as seen at `depth` ``[n]`` metres (z, not range)."""
     z = np.asarray(depth, dtype=np.float64)
     return np.column_stack([pixels_to_normalized(camera, pixels) * z[:, None], z])
-
-
-def depth_to_points(camera: Camera, depth: Float32Array, step: int = 1) -> FloatArray:
-    """Valid points ``[n, 3]`` in the camera frame of every `step`-th pixel of a depth image ``[H, W]``."""
-    v, u = np.mgrid[step // 2 : depth.shape[0] : step, step // 2 : depth.shape[1] : step]
-    z = depth[v, u].ravel()
-    valid = np.isfinite(z) & (z > 0)
-    return back_project(camera, np.column_stack([u.ravel(), v.ravel()])[valid], z[valid])
