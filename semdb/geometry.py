@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from semdb.types import Camera, Float32Array, FloatArray
+from semdb.types import Camera, FloatArray
 
 POSE_UNIT_M, POSE_UNIT_DEG = 0.3, 15.0  # so far apart two poses are at `pose_distances` of 1
 
