@@ -61,6 +61,29 @@ def _products(basis: Any, seen: Any, out: Any) -> None:
         out[i] = total
 
 
+@kernel
+def _invert_4x4(matrix: Any, work: Any, inverse: Any) -> bool:
+    """Fills `inverse` by elimination without pivots, which a positive definite matrix allows; False where it is not."""
+    for i in range(4):
+        for j in range(4):
+            work[i, j] = matrix[i, j]
+            inverse[i, j] = 1.0 if i == j else 0.0
+    for i in range(4):
+        if not work[i, i] > 1e-12 * matrix[i, i]:
+            return False
+        scale = 1.0 / work[i, i]
+        for j in range(4):
+            work[i, j] *= scale
+            inverse[i, j] *= scale
+        for k in range(4):
+            factor = work[k, i]
+            if k != i:
+                for j in range(4):
+                    work[k, j] -= factor * work[i, j]
+                    inverse[k, j] -= factor * inverse[i, j]
+    return True
+
+
 @kernel(fastmath=True)
 def align_patches(
     template: Any, image: Any, at: Any, warp: Any, step: Any, guess: Any, found: Any, likeness: Any
@@ -76,7 +99,8 @@ def align_patches(
     count = SIDE * SIDE
     grid = np.empty((RIM, RIM))
     basis, seen = np.empty((4, count)), np.empty(count)
-    normal, right = np.empty((4, 4)), np.empty(4)
+    normal, work, inverse = np.empty((4, 4)), np.empty((4, 4)), np.empty((4, 4))
+    right = np.empty(4)
     for n in range(len(at)):
         likeness[n] = -1.0
         s, m = step[n], warp[n]
@@ -91,7 +115,8 @@ def align_patches(
         shape = normal[0, 0] * normal[1, 1] - normal[0, 1] * normal[0, 1]
         if contrast < LEAST_CONTRAST * count or shape < LEAST_GRADIENT * count * count:
             continue
-        inverse = np.linalg.inv(normal)
+        if not _invert_4x4(normal, work, inverse):
+            continue
         x, y, moved = guess[n, 0], guess[n, 1], FAR
         for _ in range(ROUNDS):
             if not _inside(image, x, y, reach) or (x - guess[n, 0]) ** 2 + (y - guess[n, 1]) ** 2 > FAR * FAR:
@@ -103,11 +128,16 @@ def align_patches(
                     seen[k] = _sample(image, x + s * (m[0, 0] * u + m[0, 1] * v), y + s * (m[1, 0] * u + m[1, 1] * v))
                     k += 1
             _products(basis, seen, right)
-            gain = (inverse[2] * right).sum()
+            gain = 0.0
+            dx = dy = 0.0
+            for i in range(4):
+                gain += inverse[2, i] * right[i]
+                dx += inverse[0, i] * right[i]
+                dy += inverse[1, i] * right[i]
             if not (0.2 < gain < 5.0):
                 moved = FAR
                 break
-            dx, dy = (inverse[0] * right).sum() / gain, (inverse[1] * right).sum() / gain
+            dx, dy = dx / gain, dy / gain
             x, y, moved = x + dx, y + dy, abs(dx) + abs(dy)
             if moved < STILL:
                 break

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from semdb.types import BoolArray, Float32Array, FloatArray, IntArray
 
 BACKGROUND = -1
+NOTHING = -1e30  # what is less close is not there
 
 
 class Evidence(StrEnum):
@@ -56,17 +57,19 @@ def _no_matches() -> Matches:
     return Matches(empty, empty, np.zeros(0, np.float32), np.zeros(0, np.bool_))
 
 
-def squared_distances(first: npt.NDArray[np.generic], second: npt.NDArray[np.generic]) -> Float32Array:
-    """Distances ``[n, m]``: squared Euclidean for float32 unit vectors, Hamming for packed uint8 bits."""
+def closeness(first: npt.NDArray[np.generic], second: npt.NDArray[np.generic]) -> Float32Array:
+    """How alike descriptors are ``[n, m]``: cosine of float32 unit vectors, or minus the bits in which uint8 differ."""
     if first.dtype == np.uint8:
         a = np.unpackbits(np.asarray(first, np.uint8), axis=1).astype(np.float32)
         b = np.unpackbits(np.asarray(second, np.uint8), axis=1).astype(np.float32)
-        hamming: Float32Array = a.sum(1)[:, None] + b.sum(1)[None] - 2 * (a @ b.T)
-        return hamming
-    product = np.asarray(first, np.float32) @ np.asarray(second, np.float32).T
-    product *= -2
-    product += 2
-    return np.asarray(np.maximum(product, 0, out=product), np.float32)
+        return np.asarray(2 * (a @ b.T) - a.sum(1)[:, None] - b.sum(1)[None], np.float32)
+    return np.asarray(first, np.float32) @ np.asarray(second, np.float32).T
+
+
+def distance_of(close: Float32Array, dtype: np.dtype[np.generic]) -> Float32Array:
+    """The distance that goes with `closeness`: squared Euclidean of unit vectors, Hamming of bits; inf for none."""
+    distance = -close if dtype == np.uint8 else np.maximum(2 - 2 * close, 0)
+    return np.asarray(np.where(close < NOTHING, np.inf, distance), np.float32)
 
 
 def _ratio_power(dtype: np.dtype[np.generic]) -> int:
@@ -87,16 +90,24 @@ class _Mutual:
         return np.asarray(self.distance < ratio * self.second)
 
 
-def _mutual(distances: Float32Array, rows: IntArray, columns: IntArray) -> _Mutual:
-    """Mutual nearest neighbours between `rows` and `columns` of `distances` ``[n, m]``."""
-    from semdb.localization.matching_kernels import scan
+def _mutual(
+    close: Float32Array, dtype: np.dtype[np.generic], rows: IntArray | None = None, columns: IntArray | None = None
+) -> _Mutual:
+    """Mutual nearest neighbours between `rows` and `columns` (or all) of the `closeness` ``[n, m]`` of `dtype`."""
+    from semdb.localization.matching_kernels import scan, scan_all
 
+    everything = rows is None or columns is None
+    if rows is None or columns is None:
+        rows, columns = (np.arange(size, dtype=np.int32) for size in close.shape)
     n, m = len(rows), len(columns)
     nearest, best, second = np.empty(n, np.int32), np.empty(n, np.float32), np.empty(n, np.float32)
     best_back = np.empty(m, np.float32)
-    scan(distances, rows, columns, nearest, best, second, best_back)
-    keep = best <= best_back[nearest]
-    return _Mutual(rows[keep], columns[nearest[keep]], best[keep], second[keep])
+    if everything:
+        scan_all(close, nearest, best, second, best_back)
+    else:
+        scan(close, rows, columns, nearest, best, second, best_back)
+    keep = best >= best_back[nearest]
+    return _Mutual(rows[keep], columns[nearest[keep]], distance_of(best[keep], dtype), distance_of(second[keep], dtype))
 
 
 def match_keypoints(
@@ -145,13 +156,12 @@ def _match_block(
     options: MatchingOptions,
 ) -> Matches:
     """Pairs of descriptors that may all be compared. First the whole image, then what the classes add."""
-    distances = squared_distances(query_descriptors, keyframe_descriptors)
-    power = _ratio_power(query_descriptors.dtype)
-    taken_query, taken_keyframe = (np.zeros(size, np.bool_) for size in distances.shape)
+    close, dtype = closeness(query_descriptors, keyframe_descriptors), query_descriptors.dtype
+    power = _ratio_power(dtype)
+    taken_query, taken_keyframe = (np.zeros(size, np.bool_) for size in close.shape)
     found: list[tuple[IntArray, IntArray]] = []
     if options.evidence is Evidence.ALL:
-        everything = (np.arange(size, dtype=np.int32) for size in distances.shape)
-        pairs = _mutual(distances, *everything)
+        pairs = _mutual(close, dtype)
         q, k = query_classes[pairs.rows], keyframe_classes[pairs.columns]
         contradicts = (q != k) & (q != BACKGROUND) & (k != BACKGROUND)
         keep = pairs.passing(np.where(contradicts, options.contradiction_ratio, options.ratio) ** power)
@@ -162,13 +172,13 @@ def _match_block(
             continue
         rows = np.flatnonzero(query_classes == category).astype(np.int32)
         columns = np.flatnonzero(keyframe_classes == category).astype(np.int32)
-        pairs = _mutual(distances, rows, columns)
+        pairs = _mutual(close, dtype, rows, columns)
         keep = pairs.passing(options.ratio**power) & ~taken_query[pairs.rows] & ~taken_keyframe[pairs.columns]
         found.append((pairs.rows[keep], pairs.columns[keep]))
     i = np.concatenate([pair[0] for pair in found]) if found else np.zeros(0, np.int32)
     j = np.concatenate([pair[1] for pair in found]) if found else np.zeros(0, np.int32)
     same = (query_classes[i] == keyframe_classes[j]) & (query_classes[i] != BACKGROUND)
-    return Matches(i, j, distances[i, j], same)
+    return Matches(i, j, distance_of(close[i, j], dtype), same)
 
 
 def _sorted(blocks: Sequence[Matches]) -> Matches:
@@ -204,11 +214,12 @@ def match_guided(
     visible = np.flatnonzero(np.isfinite(projected_xy).all(axis=1))
     if len(query_descriptors) == 0 or len(visible) == 0:
         return _no_matches()
-    i, j = _pairs_within(query_xy, projected_xy[visible], options.guided_radius_px)
+    if query_signs is None or keyframe_signs is None:
+        query_signs, keyframe_signs = np.zeros(len(query_xy), np.int8), np.zeros(len(projected_xy), np.int8)
+    i, j = _pairs_within(
+        query_xy, projected_xy[visible], query_signs, keyframe_signs[visible], options.guided_radius_px
+    )
     j = visible[j].astype(np.int32)
-    if query_signs is not None and keyframe_signs is not None:
-        equal = query_signs[i] == keyframe_signs[j]
-        i, j = i[equal], j[equal]
     same_class = (query_classes[i] == keyframe_classes[j]) & (query_classes[i] != BACKGROUND)
     if options.evidence is Evidence.OBJECTS:
         i, j, same_class = i[same_class], j[same_class], same_class[same_class]
@@ -225,8 +236,14 @@ def match_guided(
     return Matches(i[order], j[order], distance[order], same_class[order])
 
 
-def _pairs_within(first: FloatArray, second: FloatArray, radius: float) -> tuple[IntArray, IntArray]:
-    """Indexes of all pairs of points ``[n, 2]`` and ``[m, 2]`` that are at most `radius` apart."""
+def _pairs_within(
+    first: FloatArray,
+    second: FloatArray,
+    first_signs: npt.NDArray[np.int8],
+    second_signs: npt.NDArray[np.int8],
+    radius: float,
+) -> tuple[IntArray, IntArray]:
+    """Indexes of all pairs of points ``[n, 2]`` and ``[m, 2]`` of equal sign that are at most `radius` apart."""
     from semdb.localization.matching_kernels import count_near
 
     x, y = np.ascontiguousarray(first[:, 0]), np.ascontiguousarray(first[:, 1])
@@ -235,7 +252,7 @@ def _pairs_within(first: FloatArray, second: FloatArray, radius: float) -> tuple
     room = 8 * (len(first) + len(second))
     while True:
         i, j = np.empty(room, np.int32), np.empty(room, np.int32)
-        found = count_near(x, y, order, to_x, to_y, radius, i, j)
+        found = count_near(x, y, first_signs, order, to_x, to_y, second_signs, radius, i, j)
         if found <= room:
             return i[:found], j[:found]
         room = found
@@ -244,7 +261,7 @@ def _pairs_within(first: FloatArray, second: FloatArray, radius: float) -> tuple
 def _paired_distances(
     first: npt.NDArray[np.generic], second: npt.NDArray[np.generic], i: IntArray, j: IntArray
 ) -> Float32Array:
-    """`squared_distances` of rows `i` of one with rows `j` of the other, ``[k]``."""
+    """Distances of rows `i` of one with rows `j` of the other, ``[k]``."""
     if first.dtype == np.uint8:
         differing = np.bitwise_count(np.asarray(first[i], np.uint8) ^ np.asarray(second[j], np.uint8))
         return np.asarray(differing.sum(axis=1), np.float32)

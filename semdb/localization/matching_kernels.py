@@ -9,22 +9,44 @@ import numpy as np
 from semdb.compiled import kernel
 
 
-@kernel
-def scan(distances: Any, rows: Any, columns: Any, nearest: Any, best: Any, second: Any, best_back: Any) -> None:
-    """Nearest, its distance and the second least of each of `rows` among `columns` of `distances` ``[n, m]``.
+@kernel(fastmath=True)
+def scan_all(closeness: Any, nearest: Any, best: Any, second: Any, best_back: Any) -> None:
+    """Of each row of `closeness` ``[n, m]`` the greatest, where it is, and the second greatest.
 
-    `best_back` gets the least distance of each of `columns`. Of equal ones the first is the nearest. Indexes in
-    `nearest` count `columns`; without a second it is inf.
+    `best_back` gets the greatest of each column. Of equal ones the first is the nearest. Without a second it is
+    -1e38. The matrix must be finite and have a column; it is as it was when this returns.
     """
-    best_back[:] = np.inf
+    least = np.float32(-1.0e38)
+    best_back[:] = least
+    for i in range(closeness.shape[0]):
+        greatest = least
+        for j in range(closeness.shape[1]):
+            greatest = max(greatest, closeness[i, j])
+        for j in range(closeness.shape[1]):
+            best_back[j] = max(best_back[j], closeness[i, j])
+        at = 0
+        while at + 1 < closeness.shape[1] and closeness[i, at] < greatest:
+            at += 1
+        closeness[i, at] = least
+        following = least
+        for j in range(closeness.shape[1]):
+            following = max(following, closeness[i, j])
+        closeness[i, at] = greatest
+        nearest[i], best[i], second[i] = at, greatest, following
+
+
+@kernel
+def scan(closeness: Any, rows: Any, columns: Any, nearest: Any, best: Any, second: Any, best_back: Any) -> None:
+    """`scan_all` of some `rows` and `columns`; indexes in `nearest` count `columns`."""
+    least = np.float32(-1.0e38)
+    best_back[:] = least
     for i in range(len(rows)):
-        line = distances[rows[i]]
-        first, following, at = np.float32(np.inf), np.float32(np.inf), 0
+        first, following, at = least, least, 0
         for j in range(len(columns)):
-            value = line[columns[j]]
-            best_back[j] = min(best_back[j], value)
-            if value < following:
-                if value < first:
+            value = closeness[rows[i], columns[j]]
+            best_back[j] = max(best_back[j], value)
+            if value > following:
+                if value > first:
                     following, first, at = first, value, j
                 else:
                     following = value
@@ -32,8 +54,10 @@ def scan(distances: Any, rows: Any, columns: Any, nearest: Any, best: Any, secon
 
 
 @kernel
-def count_near(x: Any, y: Any, order: Any, to_x: Any, to_y: Any, radius: float, i: Any, j: Any) -> int:
-    """Pairs (i, j) of points that are at most `radius` apart, by ascending j; fills `i` and `j` as far as they reach.
+def count_near(
+    x: Any, y: Any, sign: Any, order: Any, to_x: Any, to_y: Any, to_sign: Any, radius: float, i: Any, j: Any
+) -> int:
+    """Pairs (i, j) of points of equal sign at most `radius` apart, by ascending j; fills `i`, `j` as far as they reach.
 
     `order` sorts `x`. Returns how many there are, which may be more than there is room for.
     """
@@ -53,7 +77,7 @@ def count_near(x: Any, y: Any, order: Any, to_x: Any, to_y: Any, radius: float, 
             if dx > radius:
                 break
             dy = y[n] - to_y[k]
-            if dx * dx + dy * dy <= radius * radius:
+            if dx * dx + dy * dy <= radius * radius and sign[n] == to_sign[k]:
                 if found < len(i):
                     i[found], j[found] = n, k
                 found += 1
@@ -72,12 +96,12 @@ def two_least(values: Any, groups: Any, least: Any, second: Any) -> None:
             second[group] = value
 
 
-@kernel
+@kernel(fastmath=True)
 def dot_pairs(first: Any, second: Any, i: Any, j: Any, out: Any) -> None:
     """Dot products ``[k]`` of rows ``i[k]`` of one and ``j[k]`` of the other."""
     for k in range(len(i)):
-        a, b = first[i[k]], second[j[k]]
+        one, two = i[k], j[k]
         total = np.float32(0)
-        for d in range(len(a)):
-            total += a[d] * b[d]
+        for d in range(first.shape[1]):
+            total += first[one, d] * second[two, d]
         out[k] = total

@@ -10,11 +10,12 @@ from hypothesis import strategies as st
 from semdb.localization.matching import (
     Evidence,
     MatchingOptions,
+    closeness,
+    distance_of,
     match_guided,
     match_keypoints,
-    squared_distances,
 )
-from semdb.localization.matching_kernels import count_near, scan, two_least
+from semdb.localization.matching_kernels import count_near, scan, scan_all, two_least
 
 RANDOM = np.random.default_rng(0)
 
@@ -22,6 +23,10 @@ RANDOM = np.random.default_rng(0)
 def unit_rows(count: int, width: int = 64) -> np.ndarray:
     rows = RANDOM.normal(size=(count, width))
     return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+
+
+def squared_distances(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    return distance_of(closeness(first, second), first.dtype)
 
 
 def background(count: int) -> np.ndarray:
@@ -132,17 +137,23 @@ def test_only_keypoints_of_equal_sign_match() -> None:
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 30), m=st.integers(1, 30))
 def test_scan_is_a_search_of_all(seed: int, n: int, m: int) -> None:
     random = np.random.default_rng(seed)
-    distances = random.random((40, 40)).astype(np.float32)
+    close = random.integers(0, 500, (40, 40)).astype(np.float32)  # some are equal
+    before = close.copy()
     rows = np.sort(random.permutation(40)[:n]).astype(np.int32)
     columns = np.sort(random.permutation(40)[:m]).astype(np.int32)
-    nearest, best, second, back = np.empty(n, np.int32), *(np.empty(k, np.float32) for k in (n, n, m))
-    scan(distances, rows, columns, nearest, best, second, back)
-    block = distances[np.ix_(rows, columns)]
-    np.testing.assert_array_equal(nearest, block.argmin(axis=1))
-    np.testing.assert_array_equal(best, block.min(axis=1))
-    np.testing.assert_array_equal(back, block.min(axis=0))
-    expected = np.sort(block, axis=1)[:, 1] if m > 1 else np.full(n, np.inf)
-    np.testing.assert_array_equal(second, expected)
+    block = close[np.ix_(rows, columns)]
+    for whole in (False, True):
+        nearest, best, second, back = np.empty(n, np.int32), *(np.empty(k, np.float32) for k in (n, n, m))
+        if whole:
+            scan_all(block.copy(), nearest, best, second, back)
+        else:
+            scan(close, rows, columns, nearest, best, second, back)
+        np.testing.assert_array_equal(close, before)
+        np.testing.assert_array_equal(nearest, block.argmax(axis=1))
+        np.testing.assert_array_equal(best, block.max(axis=1))
+        np.testing.assert_array_equal(back, block.max(axis=0))
+        expected = np.sort(block, axis=1)[:, -2] if m > 1 else np.full(n, np.float32(-1e38))
+        np.testing.assert_array_equal(second, expected)
 
 
 @settings(max_examples=25, deadline=None)
@@ -151,10 +162,12 @@ def test_near_pairs_are_those_of_a_search_of_all(seed: int, n: int, m: int, radi
     random = np.random.default_rng(seed)
     a, b = random.uniform(0, 100, (n, 2)), random.uniform(0, 100, (m, 2))
     i, j = np.empty(n * m, np.int32), np.empty(n * m, np.int32)
+    signs, others = random.integers(0, 2, n).astype(np.int8), random.integers(0, 2, m).astype(np.int8)
     found = count_near(
-        a[:, 0].copy(), a[:, 1].copy(), np.argsort(a[:, 0]), b[:, 0].copy(), b[:, 1].copy(), radius, i, j
+        a[:, 0].copy(), a[:, 1].copy(), signs, np.argsort(a[:, 0]), b[:, 0].copy(), b[:, 1].copy(), others, radius, i, j
     )
-    near = np.argwhere(((a[:, None] - b[None]) ** 2).sum(axis=2) <= radius**2)
+    within = ((a[:, None] - b[None]) ** 2).sum(axis=2) <= radius**2
+    near = np.argwhere(within & (signs[:, None] == others[None]))
     assert sorted(zip(i[:found].tolist(), j[:found].tolist(), strict=True)) == sorted(map(tuple, near.tolist()))
     values = random.random(found).astype(np.float32)
     least, second = np.full(n, np.inf, np.float32), np.full(n, np.inf, np.float32)
