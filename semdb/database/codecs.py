@@ -2,7 +2,9 @@
 
 Layout of an array: magic ``SDBA``, version (1 byte), dtype code (1), number of dimensions (1), zero (1), CRC-32 of
 all other bytes (4), shape (4 each), data in C order. A mask (magic ``SDBM``) is the same with a one-dimensional
-uint32 array: height, width, then the lengths of the runs of the row-major mask, the first run being background.
+uint16 array: height, width, then the lengths of the runs of the row-major mask, the first run being background; a run
+of more than 65535 pixels is several with runs of 0 between. Before there was version 2, which knows uint16, masks were
+of uint32, and those of images with a side above 65535 still are. Keypoints may be compact: `semdb.database.compact`.
 """
 
 from __future__ import annotations
@@ -15,12 +17,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from semdb.database.compact import compact, expand
 from semdb.errors import CodecError
 from semdb.types import BoolArray, Features, Float32Array, IntArray, Keypoints
 
 ARRAY_MAGIC = b"SDBA"
 MASK_MAGIC = b"SDBM"
-VERSION = 1
+COMPACT_MAGIC = b"SDBK"
+VERSION = 2
+LONGEST_RUN = 65535
 KEYPOINT_COLUMNS = ("x", "y", "size", "angle", "response", "laplacian", "X", "Y", "Z")
 
 _HEADER = struct.Struct("<4sBBBBI")
@@ -32,18 +37,20 @@ _DTYPES: dict[int, np.dtype[Any]] = {
     4: np.dtype("<i4"),
     5: np.dtype("<u4"),
     6: np.dtype("<f2"),
+    7: np.dtype("<u2"),
 }
 _CODES = {dtype: code for code, dtype in _DTYPES.items()}
+_SINCE = {7: 2}  # the version that dtype codes came with; 1 where not named
 
 
 def encode_array(array: npt.NDArray[Any], *, magic: bytes = ARRAY_MAGIC) -> bytes:
-    """`array` as a blob. Raises CodecError for a dtype that has no code (float16 to float64, uint8, int32, uint32)."""
+    """`array` as a blob. Raises CodecError for a dtype that has no code (float16 to 64, uint8 to 32, int32)."""
     dtype = array.dtype.newbyteorder("<")
     code = _CODES.get(dtype)
     if code is None or array.ndim > 8:
         raise CodecError(f"an array of {array.dtype} with {array.ndim} dimensions cannot be stored")
     body = struct.pack(f"<{array.ndim}I", *array.shape) + np.ascontiguousarray(array, dtype=dtype).tobytes()
-    start = _HEADER.pack(magic, VERSION, code, array.ndim, 0, 0)[:_CHECKED]
+    start = _HEADER.pack(magic, _SINCE.get(code, 1), code, array.ndim, 0, 0)[:_CHECKED]
     return start + struct.pack("<I", zlib.crc32(body, zlib.crc32(start))) + body
 
 
@@ -54,8 +61,8 @@ def decode_array(blob: bytes, where: str, *, magic: bytes = ARRAY_MAGIC) -> npt.
     found, version, code, ndim, _, checksum = _HEADER.unpack_from(blob)
     if found != magic:
         raise CodecError(f"{where}: not a blob of this kind (it starts with {found!r}, expected {magic!r})")
-    if version != VERSION:
-        raise CodecError(f"{where}: blob format {version} is unknown, this semdb reads {VERSION}; upgrade semdb")
+    if not 1 <= version <= VERSION:
+        raise CodecError(f"{where}: blob format {version} is unknown, this semdb reads 1 to {VERSION}; upgrade semdb")
     dtype = _DTYPES.get(code)
     if dtype is None or ndim > 8 or len(blob) < _HEADER.size + 4 * ndim:
         raise CodecError(f"{where}: the blob's header is damaged (dtype code {code}, {ndim} dimensions)")
@@ -106,13 +113,29 @@ def encode_mask(mask: BoolArray) -> bytes:
     runs = np.diff(bounds)
     if flat.size and flat[0]:
         runs = np.concatenate([[0], runs])
-    return encode_array(np.concatenate([mask.shape, runs]).astype("<u4"), magic=MASK_MAGIC)
+    if max(mask.shape) > LONGEST_RUN:
+        return encode_array(np.concatenate([mask.shape, runs]).astype("<u4"), magic=MASK_MAGIC)
+    return encode_array(np.concatenate([mask.shape, _short_runs(runs)]).astype("<u2"), magic=MASK_MAGIC)
+
+
+def _short_runs(runs: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """`runs` with those above `LONGEST_RUN` in pieces, between which are runs of 0 of the other kind."""
+    long = np.flatnonzero(runs > LONGEST_RUN)
+    if not len(long):
+        return runs
+    parts: list[npt.NDArray[np.int64]] = []
+    done = 0
+    for k in long.tolist():
+        pieces, rest = divmod(int(runs[k]), LONGEST_RUN)
+        parts += [runs[done:k], np.tile([LONGEST_RUN, 0], pieces), np.array([rest])]
+        done = k + 1
+    return np.concatenate([*parts, runs[done:]])
 
 
 def decode_mask(blob: bytes, where: str) -> BoolArray:
     """The mask ``[H, W]`` of a blob. Raises CodecError."""
     numbers = decode_array(blob, where, magic=MASK_MAGIC)
-    if numbers.ndim != 1 or len(numbers) < 2 or numbers.dtype != np.dtype("<u4"):
+    if numbers.ndim != 1 or len(numbers) < 2 or numbers.dtype not in (np.dtype("<u2"), np.dtype("<u4")):
         raise CodecError(f"{where}: the mask has no size")
     height, width = int(numbers[0]), int(numbers[1])
     runs = numbers[2:].astype(np.int64)
@@ -121,8 +144,11 @@ def decode_mask(blob: bytes, where: str) -> BoolArray:
     return np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(height, width)
 
 
-def encode_keypoints(keypoints: Keypoints) -> bytes:
-    """Keypoints packed as float32 ``[n, 9]``: x, y, size, angle, response, laplacian, X, Y, Z (camera frame, m)."""
+def encode_keypoints(keypoints: Keypoints, *, small: bool = False) -> bytes:
+    """Keypoints packed as float32 ``[n, 9]``: x, y, size, angle, response, laplacian, X, Y, Z (camera frame, m).
+
+    `small`: rounded to 16 bytes each (`semdb.database.compact`) where they can be.
+    """
     features = keypoints.features
     packed = np.empty((len(features), 9), dtype=np.float32)
     packed[:, 0:2] = features.xy
@@ -131,16 +157,28 @@ def encode_keypoints(keypoints: Keypoints) -> bytes:
     packed[:, 4] = features.response
     packed[:, 5] = features.laplacian
     packed[:, 6:9] = keypoints.points
-    return encode_array(packed)
+    numbers = compact(packed) if small else None
+    return encode_array(packed) if numbers is None else encode_array(numbers, magic=COMPACT_MAGIC)
+
+
+def keypoint_rows(blob: bytes, where: str) -> Float32Array:
+    """The rows float32 ``[n, 9]`` (`KEYPOINT_COLUMNS`) of keypoints of either kind. Raises CodecError."""
+    if blob[:4] == COMPACT_MAGIC:
+        expanded = expand(decode_array(blob, where, magic=COMPACT_MAGIC))
+        if expanded is None:
+            raise CodecError(f"{where}: compact keypoints are uint16 [26 + 8 n]; these are not")
+        return expanded
+    packed = decode_array(blob, where)
+    if packed.ndim != 2 or packed.shape[1] != 9 or packed.dtype != np.dtype("<f4"):
+        raise CodecError(f"{where}: keypoints are float32 [n, 9], not {packed.dtype} {packed.shape}")
+    return packed
 
 
 def decode_keypoints(
     blob: bytes, descriptors: npt.NDArray[np.generic] | None, object_index: IntArray, where: str
 ) -> Keypoints:
     """Keypoints of a packed row. `descriptors` None leaves them out (shape ``[n, 0]``). Raises CodecError."""
-    packed = decode_array(blob, where)
-    if packed.ndim != 2 or packed.shape[1] != 9 or packed.dtype != np.dtype("<f4"):
-        raise CodecError(f"{where}: keypoints are float32 [n, 9], not {packed.dtype} {packed.shape}")
+    packed = keypoint_rows(blob, where)
     count = len(packed)
     if descriptors is None:
         descriptors = np.empty((count, 0), dtype=np.float32)

@@ -10,7 +10,7 @@ import numpy as np
 from sqlalchemy import Connection, Engine, Select, select
 
 from semdb.database import retry
-from semdb.database.codecs import decode_array, decode_keypoints, decode_mask, decode_vectors
+from semdb.database.codecs import decode_array, decode_keypoints, decode_mask, decode_vectors, keypoint_rows
 from semdb.database.records import StoredImage, StoredKeyframe, StoredObject
 from semdb.database.tables import (
     cameras,
@@ -172,7 +172,7 @@ def _keyframe(rows: dict[str, dict[int, Any]], key: int, with_descriptors: bool)
     if blob is None or (with_descriptors and key not in rows["descriptors"]):
         raise CodecError(f"keyframe {key} has no keypoints: delete its recording and ingest it again")
     described = decode_array(rows["descriptors"][key], f"descriptors of keyframe {key}") if with_descriptors else None
-    count = len(decode_array(blob, f"keypoints of keyframe {key}"))
+    count = len(keypoint_rows(blob, f"keypoints of keyframe {key}"))
     object_index = np.full(count, -1, dtype=np.int32)
     for item in object_rows:
         # "count" is also a method of a row

@@ -144,7 +144,7 @@ class KeyframeWriter:
                 **features,
                 "count": len(description.keypoints),
                 "count_3d": int(np.isfinite(points).all(axis=1).sum()),
-                "data": encode_keypoints(description.keypoints),
+                "data": encode_keypoints(description.keypoints, small=record.descriptor_dtype == "float16"),
             },
             descriptors={**features, "data": encode_array(_packed(description, record.descriptor_dtype))},
         )

@@ -1,0 +1,59 @@
+"""SEMDB_DESCRIPTOR_DTYPE=float16: half the room, read like all others, beside them in one map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from sqlalchemy import func, select
+
+from semdb.database import tables
+from semdb.database.store import Store, open_store
+from semdb.ingest import IngestOptions, ingest_recordings
+from semdb.settings import Settings
+
+
+def settings(url: str, dtype: str) -> Settings:
+    made = {"detector": "recorded", "encoder": "gist", "features": "surf", "max_keypoints": 300, "threads": 1}
+    return Settings(database_url=url, descriptor_dtype=dtype, **made)  # type: ignore[arg-type]
+
+
+def bytes_of(store: Store, table: str) -> int:
+    column = tables.metadata.tables[table].c.data
+    with store.engine.connect() as connection:
+        return int(connection.execute(select(func.sum(func.length(column)))).scalar_one())
+
+
+def test_small_rows_hold_the_same_in_half_the_room(room: Path, database_url: str, tmp_path: Path) -> None:
+    whole = f"sqlite:///{tmp_path / 'whole.sqlite3'}"
+    options = IngestOptions(keyframes=4, map_name="m")
+    for url, dtype in ((whole, "float32"), (database_url, "float16")):
+        ingest_recordings([room], settings(url, dtype), options)
+    with open_store(whole) as large, open_store(database_url) as small:
+        keypoints = sum(len(kept.keypoints) for kept in large.load_keyframes(large.keyframe_ids(1)))
+        assert keypoints > 200
+        assert bytes_of(large, "keypoints") == 4 * 20 + 36 * keypoints
+        assert bytes_of(small, "keypoints") == 4 * 68 + 16 * keypoints
+        assert bytes_of(small, "descriptors") == 4 * 20 + 2 * 64 * keypoints
+        pairs = zip(
+            large.load_keyframes(large.keyframe_ids(1)), small.load_keyframes(small.keyframe_ids(1)), strict=True
+        )
+        for expected, found in pairs:
+            np.testing.assert_allclose(found.keypoints.features.xy, expected.keypoints.features.xy, atol=0.005)
+            np.testing.assert_allclose(found.keypoints.points, expected.keypoints.points, atol=1e-4)
+            before, after = expected.keypoints.features.descriptors, found.keypoints.features.descriptors
+            assert after.dtype == np.float32
+            assert np.abs(after.astype(np.float64) - before.astype(np.float64)).max() < 3e-4
+            np.testing.assert_array_equal(found.keypoints.object_index, expected.keypoints.object_index)
+
+
+def test_one_map_has_rows_of_both_kinds(room: Path, tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'a.sqlite3'}"
+    for name, dtype in (("first", "float32"), ("second", "float16")):
+        ingest_recordings([room], settings(url, dtype), IngestOptions(keyframes=2, map_name="m", name=name))
+    with open_store(url) as store:
+        first, also_first, second, also_second = store.load_keyframes(store.keyframe_ids(1))
+        for one, other in ((first, second), (also_first, also_second)):
+            assert one.frame_index == other.frame_index
+            np.testing.assert_allclose(one.keypoints.points, other.keypoints.points, atol=1e-4)
+            assert not np.array_equal(one.keypoints.features.descriptors, other.keypoints.features.descriptors)
