@@ -99,16 +99,11 @@ def _observations(
     return np.column_stack([view.xy[rows], sigma, depth, view.image_row[rows]])
 
 
-def adjusted_error_px(
-    query: View, keyframes: Sequence[KeyframeView], pairs: Pairs, adjusted: BundleResult
-) -> FloatArray:
-    """Distance ``[n]`` in pixels between the query's keypoints and the stored 3D points of `pairs`.
-
-    All images stand and turn as `adjusted` found; the points are those measured in the keyframes.
-    """
+def projected_error_px(query: View, pairs: Pairs, projected: Sequence[FloatArray]) -> FloatArray:
+    """Distance ``[n]`` in pixels between the query's keypoints and where their pairs are `projected`, as above."""
     error = np.empty(len(pairs))
-    for slot, projected in enumerate(project_adjusted(query, keyframes, adjusted)):
+    for slot, there in enumerate(projected):
         here = pairs.slot == slot
-        offset = projected[pairs.keypoint[here]] - query.xy[pairs.query[here]] * query.focal
+        offset = there[pairs.keypoint[here]] - query.xy[pairs.query[here]] * query.focal
         error[here] = np.hypot(offset[:, 0], offset[:, 1])
     return np.where(np.isfinite(error), error, np.inf)

@@ -19,19 +19,20 @@ def scan_all(closeness: Any, nearest: Any, best: Any, second: Any, best_back: An
     least = np.float32(-1.0e38)
     best_back[:] = least
     for i in range(closeness.shape[0]):
+        line = closeness[i]
         greatest = least
-        for j in range(closeness.shape[1]):
-            greatest = max(greatest, closeness[i, j])
-        for j in range(closeness.shape[1]):
-            best_back[j] = max(best_back[j], closeness[i, j])
+        for j in range(line.size):
+            value = line[j]
+            greatest = max(greatest, value)
+            best_back[j] = max(best_back[j], value)
         at = 0
-        while at + 1 < closeness.shape[1] and closeness[i, at] < greatest:
+        while at + 1 < line.size and line[at] < greatest:
             at += 1
-        closeness[i, at] = least
+        line[at] = least
         following = least
-        for j in range(closeness.shape[1]):
-            following = max(following, closeness[i, j])
-        closeness[i, at] = greatest
+        for j in range(line.size):
+            following = max(following, line[j])
+        line[at] = greatest
         nearest[i], best[i], second[i] = at, greatest, following
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import poselib
 
 from semdb.geometry import invert_pose, pose_error, transform_points
-from semdb.localization.adjustment import NEAREST_M, adjusted_error_px, bundle_adjust, in_front, project_adjusted
+from semdb.localization.adjustment import NEAREST_M, bundle_adjust, in_front, project_adjusted, projected_error_px
 from semdb.localization.alignment import Alignment, align_pairs
 from semdb.localization.bundle import BundleResult, MotionPrior
 from semdb.localization.matching import Matches, MatchingOptions, match_guided, match_keypoints
@@ -18,6 +18,9 @@ from semdb.localization.views import KeyframeView, View
 from semdb.types import BoolArray, FloatArray, IntArray
 
 MINIMUM_PAIRS = 6  # below, a pose from 3 points has nothing to be checked with
+RIVAL_SHARE = 0.2  # of the first inliers with the best keyframe: a rival with fewer says nothing and may be missed
+LEAST_RIVAL_ITERATIONS = 50
+MOST_RIVAL_ITERATIONS = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -308,11 +311,13 @@ def _refine(
     if not options.guided:
         unaligned = Alignment(query.xy[used.query], np.zeros(len(used), np.bool_))
         adjusted = bundle_adjust(query, keyframes, used, points[agreeing], camera_from_world, options, unaligned)
-        return pairs, adjusted_error_px(query, keyframes, pairs, adjusted), adjusted, 0
+        projected = project_adjusted(query, keyframes, adjusted)
+        return pairs, projected_error_px(query, pairs, projected), adjusted, 0
     adjusted = bundle_adjust(query, keyframes, used, points[agreeing], camera_from_world, options)
     matching = replace(options.matching, guided_radius_px=options.close_radius_px)
-    pairs = guided_pairs(query, keyframes, project_adjusted(query, keyframes, adjusted), matching)
-    agreeing = adjusted_error_px(query, keyframes, pairs, adjusted) < options.inlier_px
+    projected = project_adjusted(query, keyframes, adjusted)
+    pairs = guided_pairs(query, keyframes, projected, matching)
+    agreeing = projected_error_px(query, pairs, projected) < options.inlier_px
     if agreeing.sum() < MINIMUM_PAIRS:
         raise np.linalg.LinAlgError("too few pairs are left")
     used, points = pairs.take(agreeing), world_points_of(pairs, keyframes)[agreeing]
@@ -320,7 +325,7 @@ def _refine(
     pose = adjusted.camera_from_world
     adjusted = bundle_adjust(query, keyframes, used, points, pose, options, alignment, start=adjusted)
     aligned = int(np.count_nonzero(alignment.found))
-    return pairs, adjusted_error_px(query, keyframes, pairs, adjusted), adjusted, aligned
+    return pairs, projected_error_px(query, pairs, project_adjusted(query, keyframes, adjusted)), adjusted, aligned
 
 
 def _project(query: View, keyframes: Sequence[KeyframeView], camera_from_world: FloatArray) -> list[FloatArray]:
@@ -346,13 +351,15 @@ def rival_pose(
 ) -> int:
     """Inliers (distinct query keypoints) of the best pose elsewhere, among the pairs that `best` leaves over.
 
-    Elsewhere is more than 0.5 m or 15 degrees away; 0 when there is none.
+    Elsewhere is more than 0.5 m or 15 degrees away; 0 when there is none. It is looked for as long as it takes to find
+    one that counts.
     """
     pairs = join_pairs(matches)
     points = world_points_of(pairs, keyframes)
     camera_from_world = invert_pose(best.world_from_camera)
     left = reprojection_px(query, camera_from_world, pairs.query, points) >= 2 * options.max_reprojection_px
-    found = robust_pnp(query, pairs.take(left), points[left], options, max_iterations=1000)
+    iterations = _iterations_for(RIVAL_SHARE * best.first_of_best / max(int(left.sum()), 1))
+    found = robust_pnp(query, pairs.take(left), points[left], options, iterations)
     if found is None:
         return 0
     rival, agreeing = found
@@ -360,6 +367,16 @@ def rival_pose(
     if distance < 0.5 and angle < 15:
         return 0
     return len(np.unique(pairs.take(left).query[agreeing]))
+
+
+def _iterations_for(share: float) -> int:
+    """Random samples of three until one has none but right pairs, of which there is a `share`: all but 1 in 1000 times.
+
+    Fischler and Bolles, Random sample consensus, CACM 24(6), 1981.
+    """
+    success = min(max(share, 0.0), 0.99) ** 3
+    needed = np.log(0.001) / np.log1p(-success) if success > 0 else np.inf
+    return int(np.ceil(np.clip(needed, LEAST_RIVAL_ITERATIONS, MOST_RIVAL_ITERATIONS)))
 
 
 def _estimate(
