@@ -9,6 +9,7 @@ import pytest
 
 from semdb.geometry import invert_pose, pose_error, pose_from, so3_exp, transform_points
 from semdb.localization.bundle import BundleProblem, MotionPrior, _Solver, _State, adjust
+from semdb.localization.bundle_kernels import move_images
 from semdb.types import FloatArray
 
 FOCAL = 520.0
@@ -168,3 +169,29 @@ def test_what_is_reported() -> None:
     assert np.allclose(
         result.image_from_world[:, :3, :3] @ result.image_from_world[:, :3, :3].swapaxes(1, 2), np.eye(3)
     )
+
+
+def test_a_rough_solution_is_a_start() -> None:
+    turns = np.array([[0.012, -0.01, 0.004], [0.0, 0.008, -0.006]])
+    problem, truth = problem_of(3, turns=turns, pixel_noise=0.3)
+    rough = adjust(problem, moved_a_little(truth), rough=True)
+    assert rough.covariance is None
+    assert np.abs(rough.shift[0]).max() > 0.005  # the query had been moved
+    warm = adjust(problem, moved_a_little(truth), start=rough)
+    cold = adjust(problem, moved_a_little(truth))
+    np.testing.assert_allclose(warm.camera_from_world, cold.camera_from_world, atol=1e-4)
+    np.testing.assert_allclose(warm.turn, cold.turn, atol=2e-4)
+    assert warm.iterations < cold.iterations
+    assert warm.covariance is not None
+    assert cold.covariance is not None
+    assert np.trace(warm.covariance) == pytest.approx(np.trace(cold.covariance), rel=0.05)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-9, 1e-5, 0.3, 2.0])
+def test_images_move_by_the_exponential(size: float) -> None:
+    random = np.random.default_rng(4)
+    pose = pose_from(so3_exp([0.3, -0.2, 0.5]), [1.0, 2.0, 3.0])
+    step = np.zeros((1, 9))
+    step[0, :6] = random.normal(size=6) * size
+    expected = pose_from(so3_exp(step[0, 3:6]), step[0, :3]) @ pose
+    np.testing.assert_allclose(move_images(pose[None], step)[0], expected, atol=1e-12)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from semdb.geometry import pose_error
 from semdb.localization.bundle_kernels import depth_sigma
 from semdb.localization.matching import Evidence, MatchingOptions
-from semdb.localization.pose import PoseOptions, estimate_pose, match_view, rival_pose
+from semdb.localization.pose import PoseOptions, _iterations_for, estimate_pose, first_pose, match_view, rival_pose
 from semdb.localization.views import ClassNumbers, make_keyframe_view
 from tests.unit.localization_scene import CAMERA, DISTORTED, Scene
 
@@ -31,6 +31,43 @@ def test_exact_views_give_the_exact_pose(seed: int, metres: float, degrees: floa
     assert distance < 1e-4
     assert angle < 1e-3
     assert estimate.inliers >= 60
+
+
+def test_a_first_pose_is_refined_with_a_keyframe_that_joins() -> None:
+    first_errors, errors = [], []
+    for seed in range(8):
+        scene, numbers = Scene(seed, count=300), ClassNumbers()
+        keyframes = [scene.keyframe(i, scene.pose(0.2, 6), numbers, pixel_noise=0.5) for i in range(2)]
+        truth = scene.pose(0.2, 8)
+        query = scene.query(truth, numbers, pixel_noise=0.5)
+        matches = [match_view(query, keyframe, NO_DEPTH.matching) for keyframe in keyframes]
+        first = first_pose(query, keyframes[:1], matches[:1], NO_DEPTH)
+        assert first is not None
+        assert first.keyframes == 1
+        assert first.first.of_best == first.first_inliers  # of one keyframe
+        alone = estimate_pose(query, keyframes[:1], matches[:1], NO_DEPTH, first)
+        joined = estimate_pose(query, keyframes, matches, NO_DEPTH, first)
+        again = estimate_pose(query, keyframes, matches, NO_DEPTH)
+        assert alone is not None
+        assert joined is not None
+        assert again is not None
+        assert alone.first_inliers == first.first_inliers
+        assert joined.first_inliers >= first.first_inliers
+        assert abs(joined.first_inliers - again.first_inliers) <= 0.05 * again.first_inliers
+        assert abs(joined.inliers - again.inliers) <= 0.03 * again.inliers
+        assert len(joined.pairs) > 1.5 * len(alone.pairs)  # those of both keyframes
+        assert pose_error(joined.world_from_camera, again.world_from_camera)[0] < 5e-4
+        first_errors.append(pose_error(first.world_from_camera, truth)[0])
+        errors.append(pose_error(joined.world_from_camera, truth)[0])
+    assert np.mean(errors) < np.mean(first_errors)
+    assert np.median(errors) < 0.003
+
+
+def test_a_rival_is_looked_for_as_long_as_it_takes() -> None:
+    assert _iterations_for(1.0) == 50
+    assert _iterations_for(0.3) == 253  # 1 - (1 - 0.027)^253 > 0.999
+    assert _iterations_for(0.05) == 1000
+    assert _iterations_for(0.0) == 1000
 
 
 def test_distortion_is_in_the_keypoints() -> None:
