@@ -37,7 +37,9 @@ def test_a_first_pose_is_refined_with_a_keyframe_that_joins() -> None:
     first_errors, errors = [], []
     for seed in range(8):
         scene, numbers = Scene(seed, count=300), ClassNumbers()
-        keyframes = [scene.keyframe(i, scene.pose(0.2, 6), numbers, pixel_noise=0.5) for i in range(2)]
+        keyframes = [
+            scene.keyframe(i, scene.pose(0.2, 6), numbers, pixel_noise=0.5, depth_noise=0.01) for i in range(2)
+        ]
         truth = scene.pose(0.2, 8)
         query = scene.query(truth, numbers, pixel_noise=0.5)
         matches = [match_view(query, keyframe, NO_DEPTH.matching) for keyframe in keyframes]
