@@ -21,7 +21,11 @@ from semdb.types import Float32Array, FloatArray, IntArray
 CAUCHY_SQUARED = 4.0  # (2 sigma)^2: where the loss leaves the parabola
 QUERY = 0  # index of the query among the images
 PARAMETERS_OF_QUERY = 9
-SHARED_VARIANCE = 0.12  # of the assumed variance that is believed whatever the residuals (see `_covariance`)
+# Of the covariance (see `_covariance`), fitted on half of the rendered rooms with keyframes near and far
+CELL = 0.152  # over the focal length: 80 pixels of 525; within it errors are alike
+SHARED_FACTOR = 2.1  # by which errors that cells have in common exceed what single cells show
+SHARED_VARIANCE = 0.08  # of the assumed variance, believed whatever the residuals
+MOST_CORRECTION = 4.0  # of the scatter of few cells
 EVIDENCE_ROUNDS = 30
 FIRST_ITERATIONS = 4  # before the variances of the priors are known
 LEAST_GAIN = 1e-3  # of the cost; smaller ones move the pose by less than a tenth of its error
@@ -240,9 +244,12 @@ def adjust(
     if rough:
         return _result(state, blocks, iterations, None)
     solver.believe_depth(state)
-    solver.information = _information(_evident_sigma(solver, state, blocks, least, greatest), count)
+    sigma = _evident_sigma(solver, state, blocks, least, greatest)
+    solver.information = _information(sigma, count)
     state, blocks, more = solver.minimise(state, max_iterations)
-    return _result(state, blocks, iterations + more, _covariance(solver, blocks, state.poses[QUERY]))
+    shown = 1 - (least / np.maximum(sigma, FIXED)) ** 2  # what is least is not known to be there at all
+    covariance = _covariance(solver, blocks, state.poses[QUERY], np.tile(np.repeat(shown, 3), count))
+    return _result(state, blocks, iterations + more, covariance)
 
 
 def _result(state: _State, blocks: _Blocks, iterations: int, covariance: FloatArray | None) -> BundleResult:
@@ -296,30 +303,45 @@ def _evident_sigma(
     return sigma
 
 
-def _covariance(solver: _Solver, blocks: _Blocks, camera_from_world: FloatArray) -> FloatArray:
+def _covariance(solver: _Solver, blocks: _Blocks, camera_from_world: FloatArray, shown: FloatArray) -> FloatArray:
     """Covariance of the query's pose in the world, with all else marginalised out.
 
-    The sandwich of Huber (1967) and White (1982): how large the errors are is read off the residuals, point by point,
-    and not taken from the noise that the weights assume; of that variance a share is kept, for what the points
-    have in common. A step (t, w) of the camera moves its centre by -R t and turns it by -R w, R being
-    world_from_camera.
+    The sandwich of Huber (1967) and White (1982): how large the errors are is read off the residuals, not taken from
+    the noise that the weights assume. Neighbours err alike (one surface is slanted, one corner of the lens is bent), so
+    residuals add up within cells of the query's image before they are squared (Liang and Zeger, Biometrika 73, 1986).
+    What cells have in common is not seen so: `SHARED_FACTOR`, and a share of the assumed variance. The least sigma
+    of a prior keeps the numbers at bay and is not believed: of its variance the share `shown` ``[9c]`` counts.
+    A step (t, w) of the camera moves its centre by -R t and turns it by -R w, R being world_from_camera.
     """
-    from semdb.localization.bundle_kernels import scatter_of_points
+    from semdb.localization.bundle_kernels import pulls_of_groups
 
+    problem = solver.problem
     reduced, _ = solver.reduced(blocks, 0.0)
-    prior = np.diag(solver.information.reshape(-1))
-    scatter, points = np.zeros_like(reduced), len(blocks.points)
-    scatter_of_points(
+    prior = solver.information.reshape(-1)
+    group = _cells_of_points(problem)
+    groups = int(group.max()) + 1
+    pulls = np.zeros((groups, len(reduced)))
+    pulls_of_groups(
         blocks.own_gradients, blocks.coupling, blocks.points, blocks.point_gradients, solver.first,
-        solver.problem.observed_image, scatter,
+        problem.observed_image, group, pulls,
     )  # fmt: skip
-    scatter *= points / max(points - PARAMETERS_OF_QUERY, 1)
+    scatter = pulls.T @ pulls * (SHARED_FACTOR * min(groups / max(groups - PARAMETERS_OF_QUERY, 1), MOST_CORRECTION))
+    scatter += SHARED_VARIANCE * reduced
+    scatter[np.diag_indices_from(scatter)] += prior * (shown - SHARED_VARIANCE)
     inverse = np.linalg.inv(reduced)
-    in_camera = (inverse @ (scatter + SHARED_VARIANCE * (reduced - prior) + prior) @ inverse)[:6, :6]
+    in_camera = (inverse @ scatter @ inverse)[:6, :6]
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = -camera_from_world[:3, :3].T
     covariance: FloatArray = turn @ in_camera @ turn.T
     return (covariance + covariance.T) / 2
+
+
+def _cells_of_points(problem: BundleProblem) -> IntArray:
+    """The cell ``[m]`` of the query's image in which each point was seen, numbered from 0."""
+    seen = np.flatnonzero(problem.observed_image == QUERY)
+    cell = np.zeros((len(problem.points), 2))
+    cell[problem.observed_point[seen]] = np.floor(problem.xy[seen] / CELL)
+    return np.unique(cell @ [1000.0, 1.0], return_inverse=True)[1].astype(np.int32)
 
 
 def pixel_sigma(size: Float32Array, focal: float, base_px: float = 1.0) -> FloatArray:

@@ -262,34 +262,28 @@ def move_images(poses: FloatArray, step: FloatArray) -> FloatArray:
 
 
 @kernel
-def scatter_of_points(
+def pulls_of_groups(
     own_gradients: FloatArray,
     coupling: FloatArray,
     point_blocks: FloatArray,
     point_gradients: FloatArray,
     first: IntArray,
     observed_image: IntArray,
-    scatter: FloatArray,
+    group: IntArray,
+    pulls: FloatArray,
 ) -> None:
-    """Adds to `scatter` ``[9c, 9c]`` the outer products of what each point, eliminated, adds to the gradient."""
+    """Adds to `pulls` ``[groups, 9c]`` what the points, eliminated, add to the gradient; point n to ``group[n]``."""
     inverse = np.empty((3, 3))
     for n in range(len(point_blocks)):
         invert_3x3(point_blocks[n], 0.0, inverse)
-        count = first[n + 1] - first[n]
-        pulls = np.empty((count, PARAMETERS))
         for k in range(first[n], first[n + 1]):
+            one = PARAMETERS * observed_image[k]
             for i in range(PARAMETERS):
                 total = own_gradients[k, i]
                 for j in range(3):
                     for r in range(3):
                         total -= coupling[k, i, r] * inverse[r, j] * point_gradients[n, j]
-                pulls[k - first[n], i] = total
-        for one in range(count):
-            for two in range(count):
-                row, column = PARAMETERS * observed_image[first[n] + one], PARAMETERS * observed_image[first[n] + two]
-                for i in range(PARAMETERS):
-                    for j in range(PARAMETERS):
-                        scatter[row + i, column + j] += pulls[one, i] * pulls[two, j]
+                pulls[group[n], one + i] += total
 
 
 @kernel

@@ -37,7 +37,7 @@ def _patch(image: Any, x: float, y: float, step: float, warp: Any, out: Any) -> 
 def compare_patches(
     template: Any, image: Any, at: Any, warp: Any, step: Any, guess: Any, likeness: Any, roughness: Any
 ) -> None:
-    """Fills `likeness` ``[n]``: the correlation of the patch of `template` about `at` ``[n, 2]`` with that of `image` about
+    """Fills `likeness` ``[n]``: how the patch of `template` about `at` ``[n, 2]`` correlates with that of `image` about
     `guess` ``[n, 2]``, or up to `REACH` pixels beside it, where it is best; or `OUTSIDE`, or `PLAIN`.
 
     Both images are uint8. `warp` ``[n, 2, 2]`` maps offsets in the template to offsets in the image; samples are `step`
