@@ -63,7 +63,11 @@ def closeness(first: npt.NDArray[np.generic], second: npt.NDArray[np.generic]) -
         a = np.unpackbits(np.asarray(first, np.uint8), axis=1).astype(np.float32)
         b = np.unpackbits(np.asarray(second, np.uint8), axis=1).astype(np.float32)
         return np.asarray(2 * (a @ b.T) - a.sum(1)[:, None] - b.sum(1)[None], np.float32)
-    return np.asarray(first, np.float32) @ np.asarray(second, np.float32).T
+    from semdb.localization.matching_kernels import multiply
+
+    close = np.empty((len(first), len(second)), np.float32)
+    multiply(np.ascontiguousarray(first, np.float32), np.ascontiguousarray(second.T, np.float32), close)
+    return close
 
 
 def distance_of(close: Float32Array, dtype: np.dtype[np.generic]) -> Float32Array:

@@ -15,7 +15,7 @@ from semdb.localization.matching import (
     match_guided,
     match_keypoints,
 )
-from semdb.localization.matching_kernels import count_near, scan, scan_all, two_least
+from semdb.localization.matching_kernels import count_near, multiply, scan, scan_all, two_least
 
 RANDOM = np.random.default_rng(0)
 
@@ -131,6 +131,16 @@ def test_only_keypoints_of_equal_sign_match() -> None:
     near = match_guided(query, query, xy, xy, background(80), background(80), query_signs=signs, keyframe_signs=turned)
     assert (signs[near.query] == turned[near.keyframe]).all()
     assert len(near) >= 60
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10**6), n=st.integers(0, 30), m=st.integers(0, 30), depth=st.integers(1, 20))
+def test_products_are_those_of_numpy(seed: int, n: int, m: int, depth: int) -> None:
+    random = np.random.default_rng(seed)
+    first, second = random.normal(size=(n, depth)).astype(np.float32), random.normal(size=(depth, m)).astype(np.float32)
+    found = np.full((n, m), np.nan, np.float32)
+    multiply(first, second, found)
+    np.testing.assert_allclose(found, first @ second, atol=1e-5)
 
 
 @settings(max_examples=25, deadline=None)
