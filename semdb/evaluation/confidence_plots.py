@@ -41,10 +41,9 @@ def confidence_figures(confidence: npt.ArrayLike, correct: npt.ArrayLike) -> dic
     }
 
 
-def has_both(result: EvaluationResult) -> bool:
-    """Whether there are right and wrong answers: without both the plots say nothing."""
-    _, correct = answers(result)
-    return bool(correct.any() and not correct.all())
+def has_confidence(result: EvaluationResult) -> bool:
+    """Whether its answers carry a confidence; those of reference methods do not."""
+    return any(query.confidence is not None for query in result.per_query)
 
 
 def confidence_plot(series: Sequence[tuple[str, FloatArray, BoolArray]]) -> Figure:

@@ -12,7 +12,7 @@ from semdb.errors import UsageError
 from semdb.evaluation import html
 from semdb.evaluation.averages import averages
 from semdb.evaluation.comparisons import table_1, table_3, table_4
-from semdb.evaluation.confidence_plots import answers, confidence_plot, has_both
+from semdb.evaluation.confidence_plots import answers, confidence_plot, has_confidence
 from semdb.evaluation.failures import explain, median_sharpness
 from semdb.evaluation.files import write_averages, write_json, write_queries_csv
 from semdb.evaluation.formats import NOTHING, errors, percent
@@ -183,7 +183,7 @@ def _percentiles(result: EvaluationResult, stage: str) -> str:
 
 
 def _optional(directory: Path, results: Sequence[EvaluationResult]) -> list[Section]:
-    """Sections for what not every run has: ablation, two truths, right and wrong answers with a confidence."""
+    """Sections for what not every run has: ablation, two truths, answers with a confidence."""
     sections: list[Section] = []
     methods = {result.method for result in results}
     if {name for _, _, name in ABLATION} <= methods:
@@ -198,7 +198,7 @@ def _optional(directory: Path, results: Sequence[EvaluationResult]) -> list[Sect
         sections.append(
             ("truth", "Can the true poses be trusted?", explained + "\n".join(html.grid_html(grid) for grid in grids))
         )
-    chosen = [result for result in results if has_both(result)]
+    chosen = [result for result in results if has_confidence(result)]
     if chosen:
         sections.append(("confidence", "Can the confidence be trusted?", _confidence(directory, chosen)))
     return sections
@@ -207,8 +207,9 @@ def _optional(directory: Path, results: Sequence[EvaluationResult]) -> list[Sect
 def _confidence(directory: Path, results: Sequence[EvaluationResult]) -> str:
     series = [(name, *answers(result)) for name, result in zip(series_names(results), results, strict=True)]
     text = (
-        "Right: a pose within 0.25 m and 5°, whatever the verdict; wrong poses and failures are the negatives. Only "
-        "results with both are drawn, and few negatives make rough curves: "
+        "Right: a pose within 0.25 m and 5°, whatever the verdict; wrong poses and failures are the negatives. Queries "
+        "of a recording that the map knows are nearly all right, and few negatives make rough curves (bench.trust asks "
+        "thousands): "
         + "; ".join(f"{name}: {int((~right).sum())} wrong of {len(right)}" for name, _, right in series)
         + "."
     )

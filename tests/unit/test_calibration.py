@@ -17,7 +17,7 @@ from semdb.evaluation.calibration import (
     precision_recall,
     reliability_bins,
 )
-from semdb.evaluation.confidence_plots import answers, confidence_figures, confidence_plot, has_both
+from semdb.evaluation.confidence_plots import answers, confidence_figures, confidence_plot, has_confidence
 from semdb.evaluation.metrics import QueryResult, summarise
 from semdb.types import Verdict
 
@@ -107,8 +107,8 @@ def test_answers_of_a_result_and_their_plot() -> None:
     confidence, correct = answers(result)
     assert confidence.tolist() == [0.9, 0.8, 0.4, 0.0]
     assert correct.tolist() == [True, False, True, False]
-    assert has_both(result) is True
-    assert has_both(replace(result, per_query=(queries[0],))) is False
+    assert has_confidence(result) is True
+    assert has_confidence(replace(result, per_query=(queries[-1],))) is False
     assert confidence_figures(confidence, correct)["auroc"] == pytest.approx(3 / 4)
     left, right = confidence_plot([("semdb", confidence, correct)]).axes
     assert np.asarray(left.get_lines()[0].get_xydata(), float)[-1] == pytest.approx([1.0, 0.5])
