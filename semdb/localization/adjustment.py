@@ -85,6 +85,7 @@ def bundle_adjust(
         depth=observed[:, 3],
         rows=observed[:, 4],
         keyframe_from_world=np.stack([keyframe.camera_from_world for keyframe in keyframes]),
+        looser=observed[:, 5],
     )
     return adjust(problem, camera_from_world, options.motion, rough=alignment is None, start=start)
 
@@ -92,11 +93,12 @@ def bundle_adjust(
 def _observations(
     view: View, rows: IntArray, aligned: BoolArray, options: PoseOptions, *, with_depth: bool
 ) -> FloatArray:
-    """(x, y, sigma, depth, row of the image) ``[n, 5]`` of keypoints `rows`."""
+    """(x, y, sigma, depth, row of the image, factor of the depth's noise) ``[n, 6]`` of keypoints `rows`."""
     sigma = pixel_sigma(view.size[rows], view.focal, options.pixel_sigma_px)
     sigma = np.where(aligned, options.aligned_sigma_px / view.focal, sigma)
     depth = view.points[rows, 2].astype(np.float64) if with_depth else np.full(len(rows), np.nan)
-    return np.column_stack([view.xy[rows], sigma, depth, view.image_row[rows]])
+    looser = np.ones(len(rows)) if view.looser is None else view.looser[rows]
+    return np.column_stack([view.xy[rows], sigma, depth, view.image_row[rows], looser])
 
 
 def projected_error_px(query: View, pairs: Pairs, projected: Sequence[FloatArray]) -> FloatArray:

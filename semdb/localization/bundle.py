@@ -67,6 +67,7 @@ class BundleProblem:
     depth: FloatArray  # [k] metres, NaN where there is none
     rows: FloatArray  # [k]
     keyframe_from_world: FloatArray  # [c - 1, 4, 4]
+    looser: FloatArray | None = None  # [k] how many times the sensor's noise a depth has; None: once
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,8 +116,8 @@ class _Solver:
 
     def __init__(self, problem: BundleProblem) -> None:
         self.problem = problem
-        ones = np.ones(len(problem.xy))
-        self.observed = np.column_stack([problem.xy, problem.sigma, problem.depth, problem.rows, ones])
+        self.looser = np.ones(len(problem.xy)) if problem.looser is None else problem.looser
+        self.observed = np.column_stack([problem.xy, problem.sigma, problem.depth, problem.rows, self.looser])
         bounds = np.arange(len(problem.points) + 1)
         self.first = np.searchsorted(problem.observed_point, bounds).astype(np.int32)
         self.images = len(problem.keyframe_from_world) + 1
@@ -155,8 +156,8 @@ class _Solver:
             if len(rows):
                 pose, depth = state.poses[image], self.problem.depth[rows]
                 z = state.points[self.problem.observed_point[rows]] @ pose[2, :3] + pose[2, 3]
-                excess = np.median(np.abs(z - depth) / _depth_sigma(depth)) * NORMAL_MEDIAN
-                self.observed[rows, 5] = max(1.0, float(excess)) ** 2
+                excess = np.median(np.abs(z - depth) / (_depth_sigma(depth) * self.looser[rows])) * NORMAL_MEDIAN
+                self.observed[rows, 5] = self.looser[rows] * max(1.0, float(excess)) ** 2
 
     def reduced(self, blocks: _Blocks, damping: float) -> tuple[FloatArray, FloatArray]:
         """Equations ``[9c, 9c]`` and gradient ``[9c]`` of the images with the points eliminated."""

@@ -13,6 +13,7 @@ import numpy as np
 from semdb.database.records import StoredKeyframe
 from semdb.database.store import Store
 from semdb.errors import CodecError, NotFoundError
+from semdb.fusion.registration import depth_noise
 from semdb.geometry import POSE_UNIT_M, pose_distances
 from semdb.localization.coarse import MapChange
 from semdb.localization.views import ClassNumbers, KeyframeView, make_keyframe_view
@@ -84,14 +85,16 @@ class KeyframeCache:
         refined = self._store.refined_points(missing) if self.points == USED else {}
         for stored in self._stored(missing):
             self._names[stored.id] = (stored.recording, stored.frame_index)
+            keypoints, looser = with_refined(stored.keypoints, refined.get(stored.id), stored.id)
             self._views[stored.id] = make_keyframe_view(
                 stored.id,
                 stored.camera,
                 stored.world_from_camera,
-                with_refined(stored.keypoints, refined.get(stored.id), stored.id),
+                keypoints,
                 [found.category for found in stored.objects],
                 self.numbers,
                 self._grey(stored),
+                looser,
             )
 
     def _stored(self, keyframe_ids: Sequence[int]) -> list[StoredKeyframe]:
@@ -150,14 +153,21 @@ class KeyframeCache:
         return self._poses
 
 
-def with_refined(keypoints: Keypoints, refined: Float32Array | None, keyframe_id: int) -> Keypoints:
-    """`keypoints` ``[n]`` with the points of `refined` ``[n, 4]`` where there are any. Raises CodecError."""
+def with_refined(
+    keypoints: Keypoints, refined: Float32Array | None, keyframe_id: int
+) -> tuple[Keypoints, Float32Array | None]:
+    """`keypoints` ``[n]`` with the points of `refined` ``[n, 4]`` where there are any.
+
+    Also how many times the sensor's noise the depth of each has (at least once). Raises CodecError.
+    """
     if refined is None:
-        return keypoints
+        return keypoints, None
     if len(refined) != len(keypoints):
         raise CodecError(
             f"refined_points of keyframe {keyframe_id}: {len(refined)} points for {len(keypoints)} keypoints; "
             "run semdb refine --force"
         )
-    found = np.isfinite(refined[:, 2])[:, None]
-    return replace(keypoints, points=np.where(found, refined[:, :3], keypoints.points).astype(np.float32))
+    found = np.isfinite(refined[:, 2])
+    points = np.where(found[:, None], refined[:, :3], keypoints.points).astype(np.float32)
+    excess = np.where(found, refined[:, 3] / depth_noise(points[:, 2].astype(np.float64)), 1.0)
+    return replace(keypoints, points=points), np.maximum(excess, 1.0).astype(np.float32)

@@ -31,6 +31,7 @@ class View:
     points: Float32Array  # [n, 3] camera frame, NaN where there is no depth
     source: IntArray  # [n]
     grey: ImageArray | None = None  # [H, W] the image, where it is at hand
+    looser: Float32Array | None = None  # [n] how many times the sensor's noise the depth of `points` has; None: once
 
     def __len__(self) -> int:
         return len(self.xy)
@@ -74,8 +75,9 @@ def make_view(
     *,
     with_points_only: bool = False,
     grey: ImageArray | None = None,
+    looser: Float32Array | None = None,
 ) -> View:
-    """The view of `keypoints`, whose object ``i`` is of class ``object_categories[i]``."""
+    """The view of `keypoints`, whose object ``i`` is of class ``object_categories[i]``; `looser` is of all of them."""
     features = keypoints.features
     table = np.array([*(numbers.of(name) for name in object_categories), BACKGROUND], np.int32)
     xy = pixels_to_normalized(camera, features.xy)
@@ -94,6 +96,7 @@ def make_view(
         points=keypoints.points[keep],
         source=keep.astype(np.int32),
         grey=grey,
+        looser=None if looser is None else looser[keep],
     )
 
 
@@ -105,9 +108,10 @@ def make_keyframe_view(
     object_categories: Sequence[str],
     numbers: ClassNumbers,
     grey: ImageArray | None = None,
+    looser: Float32Array | None = None,
 ) -> KeyframeView:
     """The view of a stored keyframe, with its points moved to the world."""
-    view = make_view(camera, keypoints, object_categories, numbers, with_points_only=True, grey=grey)
+    view = make_view(camera, keypoints, object_categories, numbers, with_points_only=True, grey=grey, looser=looser)
     return KeyframeView(
         keyframe_id=keyframe_id,
         view=view,
