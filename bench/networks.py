@@ -1,10 +1,14 @@
 """torch and ONNX Runtime on the CPU, the same networks, in one run: time by image size, and by batch.
 
-``python -m bench.networks [RECORDING...] [--detector SPEC] [--encoder SPEC] [--repeats N] [--json FILE]``
+``python -m bench.networks [RECORDING...] [--detector SPEC] [--encoder SPEC] [--repeats N] [--device D] [--json FILE]``
 
 The specs are ``torchvision:`` ones; without them networks with random weights in the published architectures are
 timed (ResNet-50-FPN, its objects being what random weights see, and ResNet-50). Images are frames of the recordings,
-resized to each size. Prints the median of each and torch's time over ONNX Runtime's, which is what to compare.
+resized to each size. Prints the median of each and torch's time over ONNX Runtime's, which is what to compare. Time is
+processor time, so that other work on the machine matters little: with one thread (SEMDB_THREADS=1) that of a quiet one.
+
+With ``--device`` (cuda, mps, cpu) torch alone runs there: images per second of `Describer.describe_batch` by the number
+of images given at once, in wall time, and the share of each stage.
 """
 
 from __future__ import annotations
@@ -23,12 +27,13 @@ import cv2
 import numpy as np
 
 from semdb.cli.options import load_settings
+from semdb.perception.describe import View, describer_from_specs
 from semdb.perception.detectors import load_detector
 from semdb.perception.encoders import load_encoder
 from semdb.perception.onnx_export import export
 from semdb.recordings import open_recordings
 from semdb.settings import Settings
-from semdb.types import ImageArray
+from semdb.types import Camera, ImageArray
 
 SIZES = ((320, 240), (640, 480), (1280, 960))
 BATCHES = (1, 2, 4, 8)
@@ -40,19 +45,21 @@ def main() -> None:
     parser.add_argument("--detector")
     parser.add_argument("--encoder")
     parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--device")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
-    settings = load_settings(device="cpu")
+    settings = load_settings(device=arguments.device or "cpu")
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         detector = arguments.detector or random_detector(folder / "detector.pth")
         encoder = arguments.encoder or random_encoder(folder / "encoder.pth")
         images = pictures(arguments.recordings)
-        results = {
-            "threads": settings.threads,
-            "detector": measure_detector(detector, folder, images, settings, arguments.repeats),
-            "encoder": measure_encoder(encoder, folder, images, settings, arguments.repeats),
-        }
+        results: dict[str, Any] = {"threads": settings.threads, "device": settings.device}
+        if arguments.device:
+            results["describe"] = measure_describe(detector, encoder, images, settings, arguments.repeats)
+        else:
+            results["detector"] = measure_detector(detector, folder, images, settings, arguments.repeats)
+            results["encoder"] = measure_encoder(encoder, folder, images, settings, arguments.repeats)
     if arguments.json is not None:
         arguments.json.write_text(json.dumps(results, indent=2) + "\n")
 
@@ -103,15 +110,41 @@ def measure_encoder(
     return rows
 
 
+def measure_describe(
+    detector: str, encoder: str, images: list[ImageArray], settings: Settings, repeats: int
+) -> list[dict[str, Any]]:
+    """Images of 640x480 described in batches; the first run of each size, which prepares the device, does not count."""
+    describer = describer_from_specs(detector, encoder, "surf", settings)
+    camera = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
+    resized = [cv2.resize(image, (640, 480), interpolation=cv2.INTER_AREA) for image in images]
+    rows = []
+    for batch in BATCHES:
+        views = [View(resized[k % len(resized)], None, camera) for k in range(batch)]
+        seconds, stages = [], []
+        for repeat in range(repeats + 1):
+            start = time.perf_counter()
+            described = describer.describe_batch(views)
+            if repeat:
+                seconds.append(time.perf_counter() - start)
+                stages += [one.timing_ms for one in described]
+        whole = sum(sum(one.values()) for one in stages)
+        shares = {name: sum(one[name] for one in stages) / whole for name in stages[0]}
+        rows.append({"batch": batch, "images_per_s": batch / statistics.median(seconds), "shares": shares})
+        parts = ", ".join(f"{name} {100 * share:.0f} %" for name, share in shares.items())
+        print(f"describe, {batch} at once on {settings.device}: {rows[-1]['images_per_s']:.2f} images/s; {parts}")
+        sys.stdout.flush()
+    return rows
+
+
 def compare(torch_work: Callable[[], object], onnx_work: Callable[[], object], repeats: int) -> dict[str, float]:
-    """Median milliseconds of both, in turns, after one run of each that does not count."""
+    """Median milliseconds of processor time of both, in turns, after one run of each that does not count."""
     times: dict[str, list[float]] = {"torch": [], "onnx": []}
     for repeat in range(repeats + 1):
         for name, work in (("torch", torch_work), ("onnx", onnx_work)):
-            start = time.perf_counter()
+            start = time.process_time()
             work()
             if repeat:
-                times[name].append((time.perf_counter() - start) * 1000)
+                times[name].append((time.process_time() - start) * 1000)
     medians = {name: statistics.median(values) for name, values in times.items()}
     return {
         "torch_ms": medians["torch"],
