@@ -1,6 +1,6 @@
 """``make test-train``: a small Mask R-CNN learns furniture from rendered rooms, starting from random weights.
 
-Not part of ``make test``: it takes 11 minutes of one core's time, less on two. ``SEMDB_THREADS=1`` is faster where
+Not part of ``make test``: it takes 12 minutes of one core's time, less on two. ``SEMDB_THREADS=1`` is faster where
 other work keeps the second one busy.
 """
 
