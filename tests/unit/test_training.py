@@ -85,6 +85,18 @@ def test_the_loss_falls(shapes: Path, tmp_path: Path) -> None:
     assert {d.category for d in detector.detect(np.zeros((48, 64, 3), np.uint8), None)} <= set(CLASSES)
 
 
+def test_mixed_precision_learns_the_same(shapes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The step of a GPU in bfloat16 on the CPU, which is coarser than float16: weights and losses stay float32."""
+    exact = train(tiny(shapes, tmp_path / "exact"), SETTINGS, stop_after=3)
+    monkeypatch.setattr(
+        "semdb.training.detector.layer_precision", lambda device, torch: torch.autocast("cpu", dtype=torch.bfloat16)
+    )
+    half = train(tiny(shapes, tmp_path / "half"), SETTINGS, stop_after=3)
+    assert half.losses != exact.losses
+    assert half.losses == pytest.approx(exact.losses, rel=0.1)
+    assert all(value.dtype == torch.float32 for value in weights(half.checkpoint).values() if value.is_floating_point())
+
+
 def test_a_run_that_was_cut_off_ends_as_if_it_had_not_been(shapes: Path, tmp_path: Path) -> None:
     options = tiny(shapes, tmp_path / "whole", epochs=(1, 0, 1), rates=(1e-3, 1e-3, 1e-3))
     whole = train(options, SETTINGS)
