@@ -52,8 +52,8 @@ def train_detector(
 
     The checkpoint is a detector: name it as torchvision:PATH.
     """
-    from semdb.cli.progress import Progress
-    from semdb.training.detector import train
+    from semdb.cli.progress import Progress, say
+    from semdb.training.detector import CHECKPOINT, train
     from semdb.training.options import TrainOptions
 
     options = TrainOptions(
@@ -77,8 +77,13 @@ def train_detector(
         save_every=save_every,
     )
     settings = load_settings(**({} if device is None else {"device": device}))
-    with Progress("training", unit="steps") as progress:
-        done = train(options, settings, resume=resume, progress=progress.go_on)
+    try:
+        with Progress("training", unit="steps") as progress:
+            done = train(options, settings, resume=resume, progress=progress.go_on)
+    except KeyboardInterrupt:
+        if (output / CHECKPOINT).exists():
+            say(f"{output / CHECKPOINT} is kept: the same command with --resume goes on from it")
+        raise
     last = f", loss {sum(done.losses[-20:]) / len(done.losses[-20:]):.3f}" if done.losses else ""
     print(f"{done.steps} steps{last}; curves in {done.curves}; use the detector as torchvision:{done.checkpoint}")
 
