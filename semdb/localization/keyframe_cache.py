@@ -120,14 +120,20 @@ class KeyframeCache:
         """Recording and frame index of a keyframe that was loaded."""
         return self._names.get(keyframe_id, ("", -1))
 
-    def near(self, pose: FloatArray, limit: float, without: Collection[int]) -> list[int]:
-        """Ids of the keyframes less than `limit` from `pose` (`pose_distances`), nearest first, but for `without`."""
+    def near(
+        self, pose: FloatArray, limit: float, without: Collection[int], count: int | None = None
+    ) -> tuple[list[int], FloatArray]:
+        """Ids and poses ``[n, 4, 4]`` of the `count` keyframes nearest to `pose`, nearest first, but for `without`.
+
+        They are less than `limit` away (`pose_distances`).
+        """
         ids, poses = self.poses()
         # the distance is at least that of the positions alone: turns are worked out for few
         close = np.flatnonzero(((poses[:, :3, 3] - pose[:3, 3]) ** 2).sum(axis=1) < (limit * POSE_UNIT_M) ** 2)
         distance = pose_distances(pose, poses[close])
         order = [int(n) for n in np.argsort(distance, kind="stable") if distance[n] < limit]
-        return [found for found in (ids[close[n]] for n in order) if found not in without]
+        rows = [close[n] for n in order if ids[close[n]] not in without][:count]
+        return [ids[n] for n in rows], poses[rows]
 
     def distances(self, pose: FloatArray, keyframe_ids: Sequence[int]) -> FloatArray:
         """How far keyframes are from `pose` (`pose_distances`); zero for one that is not there any more."""

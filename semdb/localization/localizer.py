@@ -26,6 +26,7 @@ from semdb.localization.coarse import (
 from semdb.localization.confidence import Evidence, gather_evidence
 from semdb.localization.keyframe_cache import KeyframeCache
 from semdb.localization.matching import Matches
+from semdb.localization.neighbours import by_side
 from semdb.localization.pose import (
     FirstPose,
     PoseEstimate,
@@ -40,6 +41,7 @@ from semdb.localization.views import KeyframeView, View, make_view
 from semdb.types import Candidate, Description, Float32Array, Localization, ModelInfo, Verdict
 
 FAR = 4.0  # of `pose_distances`: keyframes nearer than this may see the same things
+ASKED_BY_SIDE = 6  # so many of the nearest are candidates for each neighbour
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,7 +187,10 @@ class Localizer:
         if search.first is None or self.options.neighbours == 0:
             return
         matched = {keyframe.keyframe_id for keyframe in search.keyframes}
-        chosen = self.cache.near(search.first.world_from_camera, FAR, matched)[: self.options.neighbours]
+        pose, best = search.first.world_from_camera, search.keyframes[search.first.first.best]
+        near, poses = self.cache.near(pose, FAR, matched, ASKED_BY_SIDE * self.options.neighbours)
+        order = by_side(pose, best.world_from_camera, poses)[: self.options.neighbours]
+        chosen = [near[n] for n in order]
         if chosen:
             search.proposals += [Proposal(i, float("nan"), float("nan")) for i in chosen]
             self._match(search, chosen)

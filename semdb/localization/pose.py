@@ -62,6 +62,7 @@ class FirstSupport:
     inliers: int  # of all keyframes
     of_best: int  # with the keyframe that has most of them
     agreement: float  # their share of the pairs with that keyframe
+    best: int  # which keyframe it is
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -339,7 +340,7 @@ def _first_support(pairs: Pairs, agreeing: BoolArray) -> FirstSupport:
     counts = np.bincount(pairs.slot[agreeing])
     best = int(counts.argmax())
     tried = np.count_nonzero(pairs.slot == best)
-    return FirstSupport(len(np.unique(pairs.query[agreeing])), int(counts[best]), float(counts[best] / tried))
+    return FirstSupport(len(np.unique(pairs.query[agreeing])), int(counts[best]), float(counts[best] / tried), best)
 
 
 def rival_pose(
