@@ -37,7 +37,8 @@ from semdb.evaluation.protocols import split_paper
 from semdb.geometry import invert_pose, pose_error, pose_from, so3_exp
 from semdb.keyframes import select_keyframes
 from semdb.localization.bundle import pixel_sigma
-from semdb.localization.pose import PoseOptions, estimate_pose, join_pairs, match_view, world_points_of
+from semdb.localization.pairs import join_pairs, world_points_of
+from semdb.localization.pose import PoseOptions, estimate_pose, match_view
 from semdb.localization.views import ClassNumbers, KeyframeView, View, make_keyframe_view, make_view
 from semdb.perception.features.surf_features import SurfFeatures
 from semdb.perception.lifting import lift

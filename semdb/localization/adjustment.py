@@ -10,13 +10,12 @@ import numpy as np
 from semdb.geometry import invert_pose, transform_points
 from semdb.localization.alignment import Alignment
 from semdb.localization.bundle import BundleProblem, BundleResult, adjust, pixel_sigma
+from semdb.localization.pairs import NEAREST_M, Pairs
 from semdb.localization.views import KeyframeView, View
 from semdb.types import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
-    from semdb.localization.pose import Pairs, PoseOptions
-
-NEAREST_M = 0.05  # what is nearer is not in front of the camera
+    from semdb.localization.pose import PoseOptions
 
 
 def in_front(points: FloatArray) -> FloatArray:

@@ -10,10 +10,11 @@ import numpy as np
 import poselib
 
 from semdb.geometry import invert_pose, pose_error, transform_points
-from semdb.localization.adjustment import NEAREST_M, bundle_adjust, in_front, project_adjusted, projected_error_px
+from semdb.localization.adjustment import bundle_adjust, in_front, project_adjusted, projected_error_px
 from semdb.localization.alignment import Alignment, align_pairs
 from semdb.localization.bundle import BundleResult, MotionPrior
-from semdb.localization.matching import Matches, MatchingOptions, match_guided, match_keypoints
+from semdb.localization.matching import Matches, MatchingOptions, match_keypoints
+from semdb.localization.pairs import Pairs, guided_pairs, join_pairs, reprojection_px, world_points_of
 from semdb.localization.views import KeyframeView, View
 from semdb.types import BoolArray, FloatArray, IntArray
 
@@ -37,22 +38,6 @@ class PoseOptions:
     bundle: bool = True
     use_query_depth: bool = True
     motion: MotionPrior = field(default_factory=MotionPrior)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Pairs:
-    """2D-3D pairs of a query with several keyframes (`slot` counts them)."""
-
-    query: IntArray  # [n] keypoint of the query
-    slot: IntArray  # [n] which keyframe
-    keypoint: IntArray  # [n] keypoint of that keyframe
-    same_class: BoolArray  # [n]
-
-    def __len__(self) -> int:
-        return len(self.query)
-
-    def take(self, keep: BoolArray | IntArray) -> Pairs:
-        return Pairs(self.query[keep], self.slot[keep], self.keypoint[keep], self.same_class[keep])
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,19 +95,6 @@ class PoseEstimate:
     aligned: int = 0  # pairs whose patches are alike to a fraction of a pixel; 0 without images
 
 
-def join_pairs(matches: Sequence[Matches]) -> Pairs:
-    """Pairs of one query with several keyframes, in the order of `matches`."""
-    if not matches:
-        empty = np.zeros(0, np.int32)
-        return Pairs(empty, empty, empty, np.zeros(0, np.bool_))
-    return Pairs(
-        np.concatenate([m.query for m in matches]),
-        np.concatenate([np.full(len(m), slot, np.int32) for slot, m in enumerate(matches)]),
-        np.concatenate([m.keyframe for m in matches]),
-        np.concatenate([m.same_class for m in matches]),
-    )
-
-
 def match_view(query: View, keyframe: KeyframeView, options: MatchingOptions) -> Matches:
     """First matching, without a pose."""
     view = keyframe.view
@@ -130,24 +102,6 @@ def match_view(query: View, keyframe: KeyframeView, options: MatchingOptions) ->
         query.descriptors, view.descriptors, query.classes, view.classes, options,
         query_signs=query.signs, keyframe_signs=view.signs,
     )  # fmt: skip
-
-
-def world_points_of(pairs: Pairs, keyframes: Sequence[KeyframeView]) -> FloatArray:
-    """The stored 3D point ``[n, 3]`` of each pair, in the world."""
-    points = np.empty((len(pairs), 3))
-    for slot, keyframe in enumerate(keyframes):
-        rows = pairs.slot == slot
-        points[rows] = keyframe.world_points[pairs.keypoint[rows]]
-    return points
-
-
-def reprojection_px(query: View, camera_from_world: FloatArray, rows: IntArray, points: FloatArray) -> FloatArray:
-    """Distance ``[n]`` in (undistorted) pixels of the query between keypoints `rows` and world `points`."""
-    moved = points @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        offset = moved[:, :2] / moved[:, 2:] - query.xy[rows]
-    distance = np.hypot(offset[:, 0], offset[:, 1]) * query.focal
-    return np.where(moved[:, 2] > NEAREST_M, distance, np.inf)
 
 
 def robust_pnp(
@@ -178,28 +132,6 @@ def _pinhole(query: View) -> dict[str, Any]:
     """The camera of pixels that are undistorted and counted from the centre, as PoseLib wants it."""
     width, height = query.camera.width, query.camera.height
     return {"model": "SIMPLE_PINHOLE", "width": width, "height": height, "params": [query.focal, 0, 0]}
-
-
-def guided_pairs(
-    query: View, keyframes: Sequence[KeyframeView], projected: Sequence[FloatArray], options: MatchingOptions
-) -> Pairs:
-    """Second matching: only near the projections ``[n, 2]`` of each keyframe's points, in pixels from the centre."""
-    return join_pairs(
-        [
-            match_guided(
-                query.descriptors,
-                keyframe.view.descriptors,
-                query.xy * query.focal,
-                centres,
-                query.classes,
-                keyframe.view.classes,
-                options,
-                query_signs=query.signs,
-                keyframe_signs=keyframe.view.signs,
-            )
-            for keyframe, centres in zip(keyframes, projected, strict=True)
-        ]
-    )
 
 
 def first_pose(
