@@ -38,7 +38,10 @@ def comparable(descriptors: npt.NDArray[np.generic]) -> Float32Array:
 def match_whole_images(
     first: View, second: View, second_from_first: FloatArray, options: GateOptions
 ) -> tuple[IntArray, IntArray]:
-    """Keypoints that stand out in the whole of both images and lie within `first_px` of where a depth puts them."""
+    """Keypoints that stand out in the whole of both images and lie within `first_px` of where a depth puts them.
+
+    Without a depth it is their distance from the epipolar line that counts.
+    """
     found = match_keypoints(
         first.descriptors, second.descriptors, first.classes, second.classes,
         query_signs=first.signs, keyframe_signs=second.signs,
@@ -47,8 +50,17 @@ def match_whole_images(
     forth = _miss(first.points[one], second_from_first, second.xy[two])
     back = _miss(second.points[two], invert_pose(second_from_first), first.xy[one])
     miss = np.fmin(forth, back)
+    unknown = np.isnan(miss)
+    miss[unknown] = _off_line(first.xy[one[unknown]], second.xy[two[unknown]], second_from_first)
     keep = miss < options.first_px / second.focal
     return one[keep], two[keep]
+
+
+def _off_line(one: FloatArray, two: FloatArray, pose: FloatArray) -> FloatArray:
+    """Distance ``[n]`` of `two` from the epipolar lines of `one`, normalised."""
+    line = np.cross(pose[:3, 3], np.column_stack([one, np.ones(len(one))]) @ pose[:3, :3].T)
+    length = np.maximum(np.hypot(line[:, 0], line[:, 1]), 1e-9)
+    return np.asarray(np.abs(line[:, 0] * two[:, 0] + line[:, 1] * two[:, 1] + line[:, 2]) / length)
 
 
 def _miss(points: Float32Array, pose: FloatArray, seen: FloatArray) -> FloatArray:

@@ -23,10 +23,14 @@ class GateOptions:
 
 @dataclass(frozen=True, slots=True)
 class RegistrationOptions:
-    """Standard deviations are of the recorded pose between two keyframes, `pixel_sigma_px` of a keypoint's pixel."""
+    """Standard deviations: of the recorded pose between two keyframes, the greatest that are believed (the points show
+    how far off it is) and the least; `pixel_sigma_px` of a keypoint's pixel.
+    """
 
     pose_m: float = 0.02
     pose_rad: float = 0.01
+    least_m: float = 0.0005
+    least_rad: float = 0.0003
     pixel_sigma_px: float = 1.0
     least_points: int = 12  # fewer leave the pose as recorded, and noise from its standard deviations
 

@@ -17,6 +17,7 @@ from semdb.localization.bundle import CAUCHY_SQUARED, NORMAL_MEDIAN
 from semdb.types import FloatArray
 
 ITERATIONS = 8
+EVIDENCE_ROUNDS = 20
 LEAST_M, LEAST_RAD = 1e-5, 1e-6  # a smaller step is none
 
 
@@ -54,28 +55,55 @@ def register(
     The search begins there, or at `start`.
 
     Points with depth in one are projected into the other, both ways; where both know a depth it is compared, with the
-    sensor's noise. Gauss-Newton with a Cauchy loss; the recorded pose is a prior.
+    sensor's noise; where neither does, the two rays have to meet. Gauss-Newton with a Cauchy loss; the recorded pose is
+    a prior.
     """
     sigma = options.pixel_sigma_px / focal
-    known = np.isfinite(first.depth) | np.isfinite(second.depth)
-    if known.sum() < options.least_points:
+    if len(first.xy) < options.least_points:
         return Registration(second_from_first, _unregistered(first, second, sigma, options))
     pose = second_from_first if start is None else start
-    information = np.repeat(1 / np.array([options.pose_m, options.pose_rad]) ** 2, 3)
-    shift = _shift(second_from_first, pose)
+    spread = np.array([options.pose_m, options.pose_rad])
+    pose, shift, data = _fit(first, second, second_from_first, pose, spread, sigma)
+    spread = _evident_spread(data, shift, spread, np.array([options.least_m, options.least_rad]))
+    pose, _, _ = _fit(first, second, second_from_first, pose, spread, sigma)
+    _, _, seen = _system(first, second, pose, sigma)
+    return Registration(pose, max(sigma, float(np.median(np.abs(seen))) * NORMAL_MEDIAN * sigma))
+
+
+def _fit(
+    first: Sightings, second: Sightings, recorded: FloatArray, pose: FloatArray, spread: FloatArray, sigma: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The pose under a prior of `spread` (m, rad) about `recorded`, its shift ``[6]``, the data's information."""
+    information = np.repeat(1 / spread**2, 3)
+    shift, data = _shift(recorded, pose), np.zeros((6, 6))
     for _ in range(ITERATIONS):
-        jacobian, residual = _system(first, second, pose, sigma)
+        jacobian, residual, _ = _system(first, second, pose, sigma)
         weight = 1 / (1 + (residual * residual).sum(axis=1) / CAUCHY_SQUARED)
         weighted = jacobian * weight[:, None, None]
-        normal = np.einsum("nij,nik->jk", weighted, jacobian) + np.diag(information)
-        step = -np.linalg.solve(normal, np.einsum("nij,ni->j", weighted, residual) + information * shift)
+        data = np.einsum("nij,nik->jk", weighted, jacobian)
+        gradient = np.einsum("nij,ni->j", weighted, residual) + information * shift
+        step = -np.linalg.solve(data + np.diag(information), gradient)
         pose = pose_from(so3_exp(step[3:]), step[:3]) @ pose
         shift = shift + step
         if np.abs(step[:3]).max() < LEAST_M and np.abs(step[3:]).max() < LEAST_RAD:
             break
-    _, residual = _system(first, second, pose, sigma)
-    seen = np.abs(residual[residual[:, 2] == 0, :2])  # rows of pixels, not of depths
-    return Registration(pose, max(sigma, float(np.median(seen)) * NORMAL_MEDIAN * sigma))
+    return pose, shift, data
+
+
+def _evident_spread(data: FloatArray, shift: FloatArray, greatest: FloatArray, least: FloatArray) -> FloatArray:
+    """How far off the recorded pose is (m, rad), as the points show it: MacKay's evidence approximation (1992).
+
+    Where poses are exact, none of the freedom is left that noise would use along what points hardly determine.
+    """
+    spread = greatest
+    pull = data @ shift + np.repeat(1 / greatest**2, 3) * shift
+    for _ in range(EVIDENCE_ROUNDS):
+        information = np.repeat(1 / spread**2, 3)
+        inverse = np.linalg.inv(data + np.diag(information))
+        mean, determined = inverse @ pull, 1 - np.diag(inverse) * information
+        found = np.sqrt((mean**2).reshape(2, 3).sum(axis=1) / np.maximum(determined.reshape(2, 3).sum(axis=1), 1e-6))
+        spread = np.clip(found, least, greatest)
+    return spread
 
 
 def _shift(recorded: FloatArray, pose: FloatArray) -> FloatArray:
@@ -92,10 +120,13 @@ def _unregistered(first: Sightings, second: Sightings, sigma: float, options: Re
     return float(np.sqrt(sigma**2 + (options.pose_m / near) ** 2 + options.pose_rad**2))
 
 
-def _system(first: Sightings, second: Sightings, pose: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray]:
-    """Jacobian ``[r, 3, 6]`` by a step (metres, radians) of the second camera, and residuals ``[r, 3]`` in sigmas.
+def _system(
+    first: Sightings, second: Sightings, pose: FloatArray, sigma: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Jacobian ``[r, 3, 6]`` by a step (metres, radians) of the second camera, residuals ``[r, 3]`` in sigmas.
 
-    One row is (x, y, 0) of a point in an image, or (0, 0, depth).
+    One row is (x, y, 0) of a point in an image, (distance from the epipolar line, 0, 0), or (0, 0, depth). Also those
+    of the residuals that are of pixels, ``[q]``.
     """
     moved = first.points @ pose[:3, :3].T + pose[:3, 3]
     forth = np.isfinite(moved).all(axis=1) & (moved[:, 2] > 0.05)
@@ -112,8 +143,30 @@ def _system(first: Sightings, second: Sightings, pose: FloatArray, sigma: float)
     jacobian, residual = np.zeros((int(both.sum()), 3, 6)), np.zeros((int(both.sum()), 3))
     jacobian[:, 2] = _by_step(moved[both])[:, 2] / spread[:, None]
     residual[:, 2] = (moved[both, 2] - second.depth[both]) / spread
+    neither = ~np.isfinite(first.depth) & ~np.isfinite(second.depth)
+    rows.append(_ray_rows(first.xy[neither], second.xy[neither], pose, sigma))
+    pixels = np.concatenate([rows[0][1][:, :2].ravel(), rows[1][1][:, :2].ravel(), rows[2][1][:, 0]])
     rows.append((jacobian, residual))
-    return np.concatenate([row[0] for row in rows]), np.concatenate([row[1] for row in rows])
+    return np.concatenate([row[0] for row in rows]), np.concatenate([row[1] for row in rows]), pixels
+
+
+def _ray_rows(one: FloatArray, two: FloatArray, pose: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray]:
+    """Distance of each of `two` ``[n, 2]`` from the epipolar line of its partner, and how a step changes it.
+
+    The line is l = t x R x1; with a step (d, w) its product with x2 grows by d . (R x1 x x2) + w . (l x x2) to first
+    order. Its length changes too: without that, a shorter step between the cameras would seem to fit better.
+    """
+    turned = np.column_stack([one, np.ones(len(one))]) @ pose[:3, :3].T
+    other = np.column_stack([two, np.ones(len(two))])
+    line = np.cross(np.broadcast_to(pose[:3, 3], turned.shape), turned)
+    length = np.maximum(np.hypot(line[:, 0], line[:, 1]), 1e-9)[:, None]
+    jacobian, residual = np.zeros((len(one), 3, 6)), np.zeros((len(one), 3))
+    distance = (line * other).sum(axis=1)[:, None] / length
+    flat = line * [1.0, 1.0, 0.0] / length
+    jacobian[:, 0, :3] = np.cross(turned, other - distance * flat) / (length * sigma)
+    jacobian[:, 0, 3:] = np.cross(line, other - distance * flat) / (length * sigma)
+    residual[:, 0] = distance[:, 0] / sigma
+    return jacobian, residual
 
 
 def _by_step(points: FloatArray) -> FloatArray:

@@ -161,6 +161,23 @@ def test_two_keyframes_are_laid_on_each_other() -> None:
     assert few.noise > 0.01  # what the recorded pose may be off by
 
 
+def test_rays_alone_turn_a_keyframe_but_do_not_stretch_the_step_to_it() -> None:
+    random = np.random.default_rng(4)
+    points = random.uniform([-1, -1, 1.5], [1, 1, 4], (200, 3))
+    truth = pose_from(so3_exp([0.05, 0.2, -0.1]), [0.4, 0.1, -0.2])
+    moved = transform_points(truth, points)
+    nothing = np.full(200, np.nan)
+    first = Sightings(points[:, :2] / points[:, 2:], nothing)
+    second = Sightings(moved[:, :2] / moved[:, 2:] + random.normal(size=(200, 2)) / 520, nothing)
+    options = RegistrationOptions()
+    assert pose_error(register(first, second, truth, 520.0, options).second_from_first, truth)[0] < 0.005
+    turned = pose_from(so3_exp([0.01, -0.008, 0.006]), [0, 0, 0]) @ truth
+    found = register(first, second, turned, 520.0, options)
+    assert pose_error(found.second_from_first, truth)[1] < 0.4 * pose_error(turned, truth)[1]
+    length = np.linalg.norm(found.second_from_first[:3, 3]) / np.linalg.norm(truth[:3, 3])
+    assert length == pytest.approx(1, abs=0.03)
+
+
 def walk(scene: Scene, count: int) -> list[FloatArray]:
     return [pose_from(so3_exp([0, 0.06 * (i - count / 2), 0]), [0.25 * (i - count / 2), 0.1 * (i % 2), 0.0])
             for i in range(count)]  # fmt: skip
