@@ -7,6 +7,7 @@ be lost or arrive twice, and running a task again adds nothing.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 try:
@@ -27,6 +28,14 @@ VISIBILITY_S = HARD_LIMIT_S + 240  # a message that nobody acknowledged for so l
 
 class BrokerError(SemdbError):
     """The broker does not answer."""
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """A worker that answers: its name, ``celery@MACHINE``, and the numbers of the processes that do its work."""
+
+    name: str
+    processes: tuple[int, ...]
 
 
 def make_app(settings: Settings) -> Any:
@@ -70,3 +79,21 @@ def send_items(recording_id: int, source: str, frames: Sequence[int]) -> None:
             f"the broker {where} does not answer ({error}); the plan is in the database: when the broker is back, run "
             "`semdb ingest --resume`"
         ) from error
+
+
+def nodes(settings: Settings, seconds: float = 1.0) -> list[Node]:
+    """The workers at the broker of `settings` that answer within `seconds`, by name. Raises BrokerError."""
+    from kombu.exceptions import OperationalError
+
+    application = make_app(settings)
+    with application.connection_for_write() as connection:
+        try:
+            connection.ensure_connection(max_retries=1, timeout=5)
+            answers = application.control.inspect(timeout=seconds, connection=connection).stats() or {}
+        except (OperationalError, OSError) as error:
+            where = connection.as_uri()  # without the password
+            raise BrokerError(
+                f"the broker {where} does not answer ({error}): start it, or check SEMDB_BROKER_URL"
+            ) from error
+    found = {name: answer.get("pool", {}).get("processes", ()) for name, answer in answers.items()}
+    return [Node(name, tuple(int(pid) for pid in found[name])) for name in sorted(found)]

@@ -13,6 +13,7 @@ from semdb.cli.options import JsonFlag, Overrides, settings_options
 if TYPE_CHECKING:
     from semdb.database.records import FailedItem, RecordingStatus
     from semdb.database.store import Store
+    from semdb.settings import Settings
 
 SECONDS_BETWEEN_LOOKS = 2.0
 ERRORS_SHOWN = 10
@@ -34,8 +35,8 @@ def command(
     from semdb.cli.output import print_json
     from semdb.database.store import open_store
 
-    rates = Rates()
-    with open_store(overrides.settings().database_url) as store:
+    rates, settings = Rates(), overrides.settings()
+    with open_store(settings.database_url) as store:
         while True:
             recordings, failed = look(store, map_name)
             rates.look({recording.recording_id: recording.keyframes for recording in recordings})
@@ -47,7 +48,8 @@ def command(
                     print("\033[2J\033[H", end="")  # clear, cursor to the top left
                 show(store, recordings, failed)
                 if watch:
-                    show_work(store, recordings, rates)
+                    show_rates(recordings, rates)
+                show_workers(store, settings, everybody=watch)
             if not watch or all(recording.state == "complete" for recording in recordings):
                 return
             time.sleep(SECONDS_BETWEEN_LOOKS)
@@ -73,10 +75,9 @@ class Rates:
         return (last.get(recording_id, 0) - first[recording_id]) / (last_s - first_s)
 
 
-def show_work(store: Store, recordings: list[RecordingStatus], rates: Rates) -> None:
-    """Print rates and the time left of recordings that are not complete, and who works on them."""
+def show_rates(recordings: list[RecordingStatus], rates: Rates) -> None:
+    """Print rates and the time left of recordings that are not complete."""
     from semdb.cli.progress import format_duration
-    from semdb.database.reporting import workers
 
     for recording in recordings:
         rate = rates.per_second(recording.recording_id)
@@ -84,9 +85,33 @@ def show_work(store: Store, recordings: list[RecordingStatus], rates: Rates) -> 
         if left and rate is not None:
             time_left = f", {format_duration(left / rate)} left" if rate > 0 else ""
             print(f"{recording.map}/{recording.name}: {left} to do, {rate:.1f} keyframes/s{time_left}")
-    for worker in workers(store.engine):
+
+
+def show_workers(store: Store, settings: Settings, *, everybody: bool) -> None:
+    """Print who is idle, where a broker is set to be asked, and with `everybody` who works on how much."""
+    from importlib import import_module
+
+    from semdb.database.reporting import workers
+    from semdb.errors import SemdbError
+
+    busy = workers(store.engine)
+    for worker in busy if everybody else ():
         late = " (its lease has run out)" if worker.seconds_left < 0 else ""
         print(f"worker {worker.machine} process {worker.process}: {worker.items} keyframes in hand{late}")
+    if "broker_url" not in settings.model_fields_set:
+        return
+    try:
+        found = import_module("semdb.workers").nodes(settings)
+    except (ImportError, SemdbError) as error:  # not installed, or the broker does not answer
+        print(f"workers: {error}")
+        return
+    at_work = {(worker.machine, worker.process) for worker in busy}
+    for node in found:
+        machine = node.name.partition("@")[2]
+        idle = sum((machine, str(process)) not in at_work for process in node.processes)
+        print(f"worker {node.name}: {idle} of {len(node.processes)} processes idle")
+    if not found:
+        print("workers: none answers at the broker")
 
 
 def look(store: Store, map_name: str | None) -> tuple[list[RecordingStatus], list[FailedItem]]:

@@ -309,6 +309,40 @@ def test_a_recording_that_grows(long_room: Path, tmp_path: Path) -> None:
         assert stored(store) == 20
 
 
+def test_a_recording_that_grows_under_two_processes(long_room: Path, tmp_path: Path) -> None:
+    """One ingests, the recording gets longer, another joins in: the plan is the first one's, each keyframe is once."""
+    copy, short = tmp_path / "room", tmp_path / "short"
+    shutil.copytree(long_room, copy)
+    lists = {name: (copy / name).read_text().splitlines(keepends=True) for name in ("rgb.txt", "depth.txt")}
+
+    def grow(frames: int) -> None:
+        for name, lines in lists.items():
+            (copy / name).write_text("".join(lines[: 2 + frames]))
+
+    grow(80)
+    shutil.copytree(copy, short)
+    expected = f"sqlite:///{tmp_path / 'expected.sqlite3'}"
+    ingest_recordings([short], settings(expected), IngestOptions(stride=1, map_name="m", name="room"))
+    url = f"sqlite:///{tmp_path / 'a.sqlite3'}"
+    with open_store(url, create=True) as store:
+        command = [*COMMAND, "ingest", str(copy), "--map", "m", "--json"]
+        given = {"env": environment(url, **SPECS), "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        processes = [subprocess.Popen([*command, "--stride", "1"], **given)]  # type: ignore[call-overload]
+        services.wait_until(lambda: stored(store) >= 5, "5 keyframes")
+        grow(200)
+        processes.append(subprocess.Popen(command, **given))  # type: ignore[call-overload]
+        services.wait_until(lambda: stored(store) >= 20, "20 keyframes")
+        grow(FRAMES)
+        answers = [process.communicate(timeout=120) for process in processes]
+        assert [process.returncode for process in processes] == [0, 0], answers
+        summaries = [json.loads(out)[0] for out, _ in answers]
+        assert [summary["keyframes"] for summary in summaries] == [80, 80]
+        assert sum(summary["stored"] for summary in summaries) == 80
+        assert is_complete(store)
+        with open_store(expected) as undisturbed:
+            assert content(store) == content(undisturbed)
+
+
 @pytest.mark.parametrize("position", range(6))
 def test_a_broken_frame_in_each_position(long_room: Path, tmp_path: Path, position: int) -> None:
     copy = tmp_path / "room"
