@@ -7,22 +7,28 @@ support never lowers the confidence.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import minimize
 
 from bench.trust_rows import Row, evidence_of
-from bench.trust_suites import FIT, TEST
+from bench.trust_suites import FIT, POSITIVE, TEST
 from semdb.evaluation.calibration import auroc, expected_calibration_error
 from semdb.localization.confidence import FEATURES, confidence_features
-from semdb.types import BoolArray, FloatArray
+from semdb.localization.verdict import VerdictOptions, judge
+from semdb.types import BoolArray, FloatArray, Verdict
 
+MOST_FALSE = 0.003  # of the negative and hard queries
 PENALTY = 0.02  # of a squared weight per feature of unit variance, over the mean log loss
 
 
 def design(rows: Sequence[Row]) -> tuple[FloatArray, BoolArray]:
-    """Features ``[n, k]`` and which answers are right, of the rows that have a pose."""
-    known = [(evidence_of(row), row.is_right) for row in rows]
+    """Features ``[n, k]`` and which answers are right, of the rows with a plausible pose.
+
+    A confidence is asked of no other, and the many hopeless ones would have the greatest say.
+    """
+    known = [(evidence_of(row), row.is_right) for row in rows if row.verdict != Verdict.FAILED]
     pairs = [(confidence_features(evidence), right) for evidence, right in known if evidence is not None]
     return np.array([features for features, _ in pairs]), np.array([right for _, right in pairs], np.bool_)
 
@@ -51,14 +57,34 @@ def measure(features: FloatArray, right: BoolArray, weights: FloatArray, interce
     return f"{len(right)} poses, {right.mean():.0%} right: calibration error {error:.3f}, AUROC {area:.4f}"
 
 
+def _least_bound(rows: Sequence[Row], weights: FloatArray, intercept: float) -> float:
+    """The least bound, in steps of 0.05, with which at most `MOST_FALSE` of the hard and negative rows are false.
+
+    The other bounds of the verdict hold as they are.
+    """
+    doubtless = replace(VerdictOptions(), localized_confidence=0.0)
+    rest = [row for row in rows if judge(evidence_of(row), doubtless).verdict is Verdict.LOCALIZED]
+    evidence = [found for row in rest if (found := evidence_of(row)) is not None]
+    score = np.array([confidence_features(found) @ weights + intercept for found in evidence])
+    wrong = np.array([not row.is_right for row in rest], np.bool_)
+    asked = sum(row.kind != POSITIVE for row in rows)
+    bounds = np.arange(0.5, 1.0, 0.05)
+    for bound in bounds:
+        if np.count_nonzero(wrong & (score >= np.log(bound / (1 - bound)))) <= MOST_FALSE * asked:
+            return float(bound)
+    return float(bounds[-1])
+
+
 def fitted(rows: Sequence[Row], half: str) -> str:
     """The constants `WEIGHTS` and `INTERCEPT` of semdb/localization/confidence.py, fitted on one half of the scenes.
 
-    And the calibration that they give on both halves, over all poses, whatever the verdict.
+    And the calibration that they give on both halves, and the bound on the confidence that this half gives.
     """
-    weights, intercept = fit(*design([row for row in rows if row.half == half]))
+    chosen = [row for row in rows if row.half == half]
+    weights, intercept = fit(*design(chosen))
     lines = [f"{name:15} {weight:8.3f}" for name, weight in zip(FEATURES, weights, strict=True)]
     lines.append(f"WEIGHTS = ({', '.join(f'{w:.3f}' for w in weights)})\nINTERCEPT = {intercept:.3f}")
+    lines.append(f"localized_confidence = {_least_bound(chosen, weights, intercept):.2f}")
     for part in (FIT, TEST):
         for world in ("", *dict.fromkeys(row.world for row in rows)):
             chosen = [row for row in rows if row.half == part and world in ("", row.world)]

@@ -38,8 +38,8 @@ FEATURES = (
     "sigma",
 )
 # Of the logistic model; fitted by ``python -m bench.trust --fit fit``. None is negative.
-WEIGHTS = (0.350, 0.0, 2.908, 3.865, 0.0, 1.269, 0.0, 3.209, 0.0, 0.0, 1.444, 0.600)
-INTERCEPT = -5.467
+WEIGHTS = (0.0, 0.0, 7.302, 0.0, 0.0, 0.0, 4.749, 1.127, 0.0, 0.0, 2.632, 0.904)
+INTERCEPT = -8.960
 
 
 @dataclass(frozen=True, slots=True)

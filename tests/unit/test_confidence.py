@@ -67,7 +67,9 @@ def test_a_pose_beside_the_right_one_explains_less() -> None:
     assert found.supporters == 1
 
 
-@pytest.mark.parametrize("name", ["inliers", "first_inliers", "agreement", "spread", "explained", "aligned", "classes"])
+@pytest.mark.parametrize(
+    "name", ["inliers", "first_inliers", "agreement", "spread", "explained", "likeness", "classes"]
+)
 def test_more_support_never_lowers_the_confidence(name: str) -> None:
     value = getattr(EVIDENCE, name)
     steps = [confidence_of(replace(EVIDENCE, **{name: value * share})) for share in (0.1, 0.4, 0.7, 1.0)]
@@ -81,9 +83,10 @@ def test_a_rival_lowers_the_confidence() -> None:
 
 
 def test_confidence_is_a_probability_whatever_the_evidence() -> None:
-    nothing = Evidence(**{field.name: 0 for field in fields(Evidence)})  # type: ignore[arg-type]
+    zeros = Evidence(**{field.name: 0 for field in fields(Evidence)})  # type: ignore[arg-type]
+    nothing = replace(zeros, sigma_m=float("inf"), sigma_deg=float("inf"))
     endless = replace(EVIDENCE, sigma_m=float("inf"), sigma_deg=float("inf"), cosine=float("nan"))
-    for evidence in (nothing, endless, EVIDENCE):
+    for evidence in (zeros, nothing, endless, EVIDENCE):
         assert np.isfinite(confidence_features(evidence)).all()
         assert 0 <= confidence_of(evidence) <= 1
     assert confidence_of(nothing) < 0.1
