@@ -1,13 +1,11 @@
 """``make test-train``: a small Mask R-CNN learns furniture from rendered rooms, starting from random weights.
 
-Not part of ``make test``: it takes 12 minutes of one core's time, less on two. ``SEMDB_THREADS=1`` is faster where
-other work keeps the second one busy.
+Not part of ``make test``: it takes 12 minutes of processor time, on two cores.
 """
 
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -27,8 +25,7 @@ RECIPE = (
 
 def run(*arguments: object, folder: Path) -> None:
     """Runs ``semdb ARGUMENTS`` and shows what it says; progress too."""
-    threads = os.environ.get("SEMDB_THREADS", "2")
-    settings = environment(f"sqlite:///{folder}/unused", SEMDB_THREADS=threads, SEMDB_DEVICE="auto")
+    settings = environment(f"sqlite:///{folder}/unused", SEMDB_THREADS="2", SEMDB_DEVICE="auto")
     subprocess.run([*COMMAND, *map(str, arguments)], env=settings, timeout=3000, check=True)
 
 
