@@ -328,7 +328,7 @@ def test_order_of_the_worst_and_why() -> None:
     missed = replace(wrong, retrieves=True, retrieval_rank=None)
     assert explain(missed).startswith("retrieval missed: no keyframe within 0.3 m and 20°")
     late = replace(wrong, retrieves=True, retrieval_rank=7)
-    assert explain(late).startswith("the right keyframe came 7., but only 3 were matched")
+    assert explain(late).startswith("the right keyframe was number 7 in the ranking, but only 3 were matched")
     edges = np.zeros((40, 40, 3), np.uint8)
     edges[:, 20:] = 255
     assert sharpness(cv2.GaussianBlur(edges, (0, 0), 3)) < 0.1 * sharpness(edges)

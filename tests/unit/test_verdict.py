@@ -76,7 +76,7 @@ def test_no_pose_or_next_to_none_is_failed() -> None:
         ({"sigma_m": 0.1}, "0.10 m"),
         ({"sigma_deg": 3.0}, "3.0 deg"),
         ({"rival": 60}, "elsewhere has 60 against 80"),
-        ({"likeness": 0.1, "agreement": 0.4}, "all evidence together"),
+        ({"likeness": 0.05, "agreement": 0.36, "confirmed": 0.2}, "all evidence together"),
     ],
 )
 def test_every_doubt_makes_it_ambiguous_and_is_named(changes: dict[str, float], words: str) -> None:
