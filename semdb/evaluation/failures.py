@@ -49,7 +49,10 @@ def _step(query: QueryResult) -> str:
             f"first ten (the nearest is {near})"
         )
     elif query.retrieves and query.retrieval_rank is not None and query.retrieval_rank > query.keyframes_matched:
-        first = f"the right keyframe was number {query.retrieval_rank} in the ranking, but only {query.keyframes_matched} were matched"
+        first = (
+            f"the right keyframe was number {query.retrieval_rank} in the ranking, but only {query.keyframes_matched} "
+            "were matched"
+        )
     else:
         first = ""
     return "; ".join(part for part in (first, _end(query)) if part)
