@@ -1,21 +1,24 @@
 """How fast recordings become rows: the overlapped pipeline against one thread, the writer alone, and its memory.
 
-``python -m bench.ingest [RECORDING...] [--keyframes N] [--writer] [--memory FRAMES] [--json FILE]``, SEMDB_DETECTOR and
-SEMDB_ENCODER as for `semdb ingest`. For each recording: keyframes per second of one thread that does everything in
-turn and of the pipeline with SEMDB_THREADS threads, both in this run, and the pipeline's time over that of its networks
-alone, run by as many threads. `--writer` stores made-up keyframes of 1500 keypoints in a MariaDB of its own.
-`--memory` ingests that many small frames with the training-free models and prints the resident memory on the way.
+``python -m bench.ingest [RECORDING...] [--keyframes N] [--server] [--writer] [--memory FRAMES] [--json FILE]``,
+SEMDB_DETECTOR and SEMDB_ENCODER as for `semdb ingest`. For each recording: keyframes per second of one thread that
+does everything in turn and of the pipeline with SEMDB_THREADS threads, both in this run, and the pipeline's time over
+that of its networks alone, run by as many threads; into SQLite or, with `--server`, a MariaDB of its own. `--writer`
+stores made-up keyframes of 1500 keypoints in such a server. `--memory` ingests that many small frames with the
+training-free models and prints the resident memory on the way.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import json
 import statistics
 import sys
 import tempfile
 import time
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import SimpleQueue
@@ -33,19 +36,22 @@ from semdb.perception.describe import Describer
 from semdb.recordings import open_recordings
 from semdb.recordings.base import FrameEntry, Recording
 
+BUFFERS = ("--innodb-buffer-pool-size=256M", "--innodb-log-file-size=96M")  # the latter is MariaDB's default
+
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recordings", nargs="*", type=Path)
     parser.add_argument("--keyframes", type=int, default=60)
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--server", action="store_true")
     parser.add_argument("--writer", action="store_true")
     parser.add_argument("--memory", type=int, metavar="FRAMES")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     results: list[dict[str, Any]] = []
     for recording in [found for path in arguments.recordings for found in open_recordings(path)]:
-        results.append(measure_pipeline(recording, arguments.keyframes, arguments.rounds))
+        results.append(measure_pipeline(recording, arguments.keyframes, arguments.rounds, server=arguments.server))
     if arguments.writer:
         results.append(measure_writer())
     if arguments.memory:
@@ -57,7 +63,7 @@ def main() -> None:
         arguments.json.write_text(json.dumps(results, indent=2) + "\n")
 
 
-def measure_pipeline(recording: Recording, count: int, rounds: int) -> dict[str, Any]:
+def measure_pipeline(recording: Recording, count: int, rounds: int, *, server: bool = False) -> dict[str, Any]:
     """Rates in keyframes per second, the median of `rounds`, each round one of both in turn on an empty database."""
     settings = load_settings()
     specs = specs_for_ingest(settings, (), has_masks=recording.categories is not None)
@@ -68,13 +74,15 @@ def measure_pipeline(recording: Recording, count: int, rounds: int) -> dict[str,
     for describer in (*many, *one):
         describer.describe(frame.image, frame.depth, frame.camera, frame.instances)
     seconds: dict[str, list[float]] = {"one_thread": [], "pipeline": [], "networks": []}
-    for _ in range(rounds):
-        seconds["one_thread"].append(_timed_ingest(recording, entries, lambda s, r: _in_turn(r, s, one, entries)))
-        seconds["pipeline"].append(_timed_ingest(recording, entries, lambda s, r: _overlapped(r, s, many, entries)))
-        seconds["networks"].append(_networks_alone(recording, entries, many))
+    with databases(server=server) as new_url:
+        for _ in range(rounds):
+            for name, run, makers in (("one_thread", _in_turn, one), ("pipeline", _overlapped, many)):
+                seconds[name].append(_timed_ingest(recording, entries, new_url, makers, run))
+            seconds["networks"].append(_networks_alone(recording, entries, many))
     middle = {name: statistics.median(values) for name, values in seconds.items()}
     return {
         "recording": recording.name,
+        "database": "MariaDB" if server else "SQLite",
         "models": [model.name for model in many[0].models],
         "threads": len(many),
         "keyframes": len(entries),
@@ -86,10 +94,47 @@ def measure_pipeline(recording: Recording, count: int, rounds: int) -> dict[str,
     }
 
 
-def _timed_ingest(recording: Recording, entries: list[FrameEntry], run: Any) -> float:
-    with tempfile.TemporaryDirectory() as folder, open_store(f"sqlite:///{folder}/a.sqlite3", create=True) as store:
+@contextlib.contextmanager
+def databases(*, server: bool) -> Iterator[Callable[[], contextlib.AbstractContextManager[str]]]:
+    """What gives the URL of a new, empty database at each call: a file, or a schema of a private MariaDB."""
+    if not server:
+
+        @contextlib.contextmanager
+        def file() -> Iterator[str]:
+            with tempfile.TemporaryDirectory() as folder:
+                url = f"sqlite:///{folder}/a.sqlite3"
+                open_store(url, create=True).close()
+                yield url
+
+        yield file
+        return
+    from semdb.database import schema
+    from semdb.database.engine import make_engine
+    from tests.mariadb import private_server
+
+    with private_server(options=BUFFERS) as running:
+
+        @contextlib.contextmanager
+        def made() -> Iterator[str]:
+            with running.schema() as url:
+                engine = make_engine(url)
+                schema.upgrade(engine)
+                engine.dispose()
+                yield url
+
+        yield made
+
+
+def _timed_ingest(
+    recording: Recording,
+    entries: list[FrameEntry],
+    new_url: Callable[[], contextlib.AbstractContextManager[str]],
+    describers: list[Describer],
+    run: Callable[[Recording, Store, list[Describer], list[FrameEntry]], None],
+) -> float:
+    with new_url() as url, open_store(url) as store:
         started = time.perf_counter()
-        run(store, recording)
+        run(recording, store, describers, entries)
         return time.perf_counter() - started
 
 
@@ -143,8 +188,7 @@ def measure_writer(keyframes: int = 200) -> dict[str, Any]:
     categories = ["chair", "cup", "tv", "laptop", "person", "cup"]
     made = [samples.description(k, categories, keypoints=1500, vector_size=2048, camera=camera) for k in range(8)]
     records = [samples.record(k, described, image_size=150_000) for k, described in enumerate(made)]
-    buffers = ("--innodb-buffer-pool-size=256M", "--innodb-log-file-size=96M")  # the latter is MariaDB's default
-    with private_server(options=buffers) as server, server.schema() as url:
+    with private_server(options=BUFFERS) as server, server.schema() as url:
         engine = make_engine(url)
         schema.upgrade(engine)
         engine.dispose()
