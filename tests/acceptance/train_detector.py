@@ -1,6 +1,6 @@
 """``make test-train``: a small Mask R-CNN learns furniture from rendered rooms, starting from random weights.
 
-Not part of ``make test``: it takes 12 minutes of processor time, on two cores.
+Not part of ``make test``: it takes 13 minutes of processor time, on two cores.
 """
 
 from __future__ import annotations
