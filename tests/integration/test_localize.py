@@ -55,6 +55,7 @@ def test_images_become_poses(room: Path, url: str, images: list[Path], tmp_path:
         assert np.sqrt(np.trace(covariance[:3, :3])) < 0.05
         assert answer["inliers"] >= 14
         assert 0.5 < answer["confidence"] <= 1
+        assert answer["refinements"] == {"points": "none"}
         best = max(answer["candidates"], key=lambda candidate: candidate["inliers"])
         assert best["recording"] == "room"
         assert {"decode", "detect", "encode", "features", "filter", "rank", "match", "pose", "total"} <= set(
