@@ -252,13 +252,13 @@ def test_report_of_an_empty_result(tmp_path: Path) -> None:
 
 
 def test_report_of_an_ablation_and_two_truths(tmp_path: Path) -> None:
-    figures = Disagreement(14, 13, 0.01, 0.02, 0.03, 0.1, 0.2, 0.3, 0.004, 0.05, 1.001, 1.5, 0.6)
+    figures = Disagreement(14, 13, 0.01, 0.02, 0.03, 0.1, 0.2, 0.3, 0.004, 0.05, 1.001, 0.026, 1.5, 0.6)
     results = [replace(EMPTY, method=name) for _, _, name in ABLATION]
     results[0] = replace(results[0], disagreement=figures, other_errors=error_figures([query(1, 0.02)]))
     text = write_report(tmp_path, results).read_text(encoding="utf-8")
     assert "What each layer brings" in text
     assert "Ablation on room, 9 keyframes, 0 queries" in text
-    assert "<td>1.50 / 0.60</td>" in text
+    assert "<td>1.50 / 0.60</td><td>1.0010</td><td>26 ms</td>" in text
     assert "<td>0.0200 / 0.40</td><td>100.0 %</td>" in text
 
 
