@@ -54,7 +54,8 @@ def fit(features: FloatArray, right: BoolArray, penalty: float = PENALTY) -> tup
 def measure(features: FloatArray, right: BoolArray, weights: FloatArray, intercept: float) -> str:
     confidence = 1 / (1 + np.exp(-np.clip(features @ weights + intercept, -30, 30)))
     error, area = expected_calibration_error(confidence, right), auroc(confidence, right)
-    return f"{len(right)} poses, {right.mean():.0%} right: calibration error {error:.3f}, AUROC {area:.4f}"
+    separated = "none are wrong" if area is None else f"AUROC {area:.4f}"
+    return f"{len(right)} poses, {right.mean():.0%} right: calibration error {error:.3f}, {separated}"
 
 
 def _least_bound(rows: Sequence[Row], weights: FloatArray, intercept: float) -> float:

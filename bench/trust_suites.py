@@ -25,6 +25,7 @@ from semdb.view_overlap import ViewGrid, ViewStack, view_grid
 POSITIVE, HARD, NEGATIVE = "positive", "hard", "negative"
 FIT, TEST = "fit", "test"
 MOVED, REFURNISHED = "moved furniture", "other furniture"
+AGAIN = "second visit, other light"  # furniture moved, noise and some blur besides
 ALIKE, ELSEWHERE = "room that looks alike", "same furniture elsewhere"
 SEEN, EDGE, UNSEEN = 0.3, 0.02, 0.003  # common view with the best keyframe
 REAL_KEYFRAMES = (12, 25, 50)
@@ -42,7 +43,7 @@ class RenderedSize:
     stride: int = 3
     width: int = 640
     height: int = 480
-    like: tuple[str, ...] = (MOVED, REFURNISHED, ALIKE, ELSEWHERE)  # what is rendered beside each room
+    like: tuple[str, ...] = (MOVED, AGAIN, REFURNISHED, ALIKE, ELSEWHERE)  # what is rendered beside each room
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -178,6 +179,8 @@ def _room(work: Path, number: int, size: RenderedSize, say: Say) -> _Scene:
     few = replace(own, frames=10, lap_frames=10)
     kinds = {
         MOVED: ("-moved", HARD, replace(own, frames=12, lap_frames=12, second_visit=True)),
+        # an exposure smears over 2.4 degrees
+        AGAIN: ("-again", HARD, replace(own, frames=12, lap_frames=12, second_visit=True, lighting=0.6, blur=0.08)),
         REFURNISHED: ("-refurnished", HARD, replace(few, seed=50 + number, furniture_seed=300 + number)),
         ALIKE: ("-alike", NEGATIVE, replace(few, seed=60 + number, alike=True)),
         ELSEWHERE: ("-elsewhere", NEGATIVE, replace(few, seed=70 + number, room_seed=400 + number)),
@@ -266,8 +269,11 @@ def _queries_of_room(scene: _Scene, others: Sequence[_Scene]) -> Iterator[Query]
         other = others[number // 2 % len(others)].name if others else None
         yield from _spoiled(scene.name, scene.recording, entry, scene.name, other)
     for suite, kind, recording in scene.others:
-        for entry in recording.entries:
-            yield _query(f"{scene.name}/{suite}", recording, entry, (Asked(scene.name, suite, kind),))
+        for number, entry in enumerate(recording.entries):
+            asked = (Asked(scene.name, suite, kind),)
+            if suite == AGAIN and others:
+                asked += (Asked(others[number % len(others)].name, "other room, other light", NEGATIVE),)
+            yield _query(f"{scene.name}/{suite}", recording, entry, asked)
 
 
 def _own(map_name: str, common: float) -> tuple[Asked, ...]:

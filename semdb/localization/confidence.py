@@ -21,6 +21,7 @@ SUPPORTER_PAIRS = 6  # a keyframe with fewer inliers says nothing of its own
 NEAR_PX = 12.0  # a projected point and a keypoint this near are on the same thing
 SAME_PX = 4.0  # and this near they are at the same place
 LEAST_OBJECT_POINTS = 12  # fewer points on objects say nothing about classes
+SHARP = 0.3  # share of aligned pairs from which on an image counts as sharp
 NEUTRAL = 0.5  # of classes where there is nothing to compare, of patches where there are no images
 
 FEATURES = (
@@ -36,10 +37,11 @@ FEATURES = (
     "classes",
     "rival",
     "sigma",
+    "sharp but unlike",
 )
 # Of the logistic model; fitted by ``python -m bench.trust --fit fit``. None is negative.
-WEIGHTS = (0.0, 0.0, 7.302, 0.0, 0.0, 0.0, 4.749, 1.127, 0.0, 0.0, 2.632, 0.904)
-INTERCEPT = -8.960
+WEIGHTS = (0.000, 0.000, 8.331, 0.000, 0.000, 0.885, 0.675, 0.000, 0.000, 0.000, 1.859, 0.305, 3.551)
+INTERCEPT = -1.239
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,8 +198,10 @@ def _cells_of(pixels: Float32Array, size: FloatArray) -> BoolArray:
 
 
 def confidence_features(evidence: Evidence) -> FloatArray:
-    """What the confidence is made of ``[12]``, in the order of `FEATURES`; each grows with what speaks for the pose."""
+    """What the confidence is made of ``[13]``, in the order of `FEATURES`; each grows with what speaks for the pose."""
     rival = evidence.rival / max(evidence.first_of_best, 1)
+    # patches that do not look alike say little of a blurred image and much of a sharp one
+    sharp_but_unlike = min(evidence.aligned / SHARP, 1.0) * (1 - evidence.likeness)
     return np.array(
         [
             np.log(max(evidence.first_inliers, 1)),
@@ -212,6 +216,7 @@ def confidence_features(evidence: Evidence) -> FloatArray:
             evidence.classes,
             -min(rival, 1.5),
             -np.log(np.clip(evidence.sigma_m, 0.0005, 0.5)),
+            -sharp_but_unlike,
         ]
     )
 

@@ -33,9 +33,9 @@ class VerdictOptions:
     ambiguous_agreement: float = 0.2  # of its pairs
     convincing_inliers: int = 60  # and `many_first_inliers`: enough to stop looking at more keyframes
     minimum_spread: float = 0.19  # three cells of a 4x4 grid over the image
-    maximum_translation_sigma_m: float = 0.035
+    maximum_translation_sigma_m: float = 0.06
     maximum_rotation_sigma_deg: float = 1.5
-    localized_confidence: float = 0.8  # at most 0.3 % false on the half that the confidence was fitted on
+    localized_confidence: float = 0.85
     rival_share: float = 0.7  # of the first inliers with the best keyframe, that a pose elsewhere may have at most
 
 

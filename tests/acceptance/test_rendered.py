@@ -88,20 +88,23 @@ def localize(recording: Path, url: str, step: int) -> list[dict[str, Any]]:
 
 def test_a_second_visit_with_moved_objects_other_light_and_blur(first_visit: str, tmp_path: Path) -> None:
     # each exposure smears over 2.4 degrees, so that not every image can be localized; none may be wrongly so
+    # most poses are right all the same, and are given as ambiguous
     options = SyntheticOptions(frames=60, lap_frames=60, seed=5, second_visit=True, lighting=0.6, blur=0.4, noise=True)
     recording = render(tmp_path / "second", options)
     truth = {entry.image_path.name: entry.world_from_camera for entry in open_recording(recording).entries}
     answers = localize(recording, first_visit, 2)
-    errors = []
+    errors: dict[str, list[tuple[float, float]]] = {"localized": [], "ambiguous": [], "failed": []}
     for answer in answers:
-        if answer["verdict"] == "localized":
+        if answer["verdict"] != "failed":
             pose = pose_from(rotation_from_quat_wxyz(answer["pose"]["quat_wxyz"]), answer["pose"]["position"])
             true_pose = truth[Path(answer["image"]).name]
             assert true_pose is not None
-            errors.append(pose_error(pose, true_pose))
-    assert len(errors) >= 0.7 * len(answers)
-    assert sum(metres > 0.25 or degrees > 5 for metres, degrees in errors) == 0
-    assert np.median([metres for metres, _ in errors]) < 0.03
+            errors[answer["verdict"]].append(pose_error(pose, true_pose))
+    assert len(errors["localized"]) >= 0.25 * len(answers)
+    assert sum(metres > 0.25 or degrees > 5 for metres, degrees in errors["localized"]) == 0
+    assert np.median([metres for metres, _ in errors["localized"]]) < 0.04
+    given = errors["localized"] + errors["ambiguous"]
+    assert sum(metres <= 0.25 and degrees <= 5 for metres, degrees in given) >= 0.8 * len(answers)
 
 
 def test_another_room_is_failed_not_found(first_visit: str, tmp_path: Path) -> None:

@@ -88,12 +88,14 @@ def test_every_doubt_makes_it_ambiguous_and_is_named(changes: dict[str, float], 
 
 
 def test_few_pairs_that_agree_well_are_enough() -> None:
-    assert judge(replace(EVIDENCE, first_inliers=10, agreement=0.36), OPTIONS).verdict is Verdict.LOCALIZED
+    few = replace(EVIDENCE, first_inliers=10, agreement=0.36)
+    assert judge(few, replace(OPTIONS, localized_confidence=0.0)).verdict is Verdict.LOCALIZED
 
 
 def test_very_many_inliers_are_enough_however_few_agreed_at_first() -> None:
     guided = replace(EVIDENCE, inliers=129, first_inliers=14, first_of_best=6, agreement=0.15)
-    assert judge(guided, OPTIONS).verdict is Verdict.LOCALIZED
+    assert judge(guided, replace(OPTIONS, localized_confidence=0.0)).verdict is Verdict.LOCALIZED
+    assert judge(guided, OPTIONS).verdict is Verdict.AMBIGUOUS
     assert judge(replace(guided, inliers=60), OPTIONS).verdict is Verdict.FAILED
 
 
