@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
-import signal
-import sys
-import threading
-from collections.abc import Iterator
 from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
+from semdb.cli.ending import ends_when_told
 from semdb.cli.options import CameraOption, JsonFlag, Overrides, settings_options
 
 if TYPE_CHECKING:
@@ -63,7 +59,7 @@ def command(
     if not paths:
         raise UsageError("name the folder of a recording: semdb ingest PATH (or --resume for what workers have left)")
     options = IngestOptions(map_name=map_name, name=name, keyframes=keyframes, stride=stride, camera=camera)
-    with StagedProgress() as progress, _terminable():
+    with StagedProgress() as progress, ends_when_told():
         if queue:
             summaries = queue_recordings(paths, settings, options, _send(), progress=progress.update, say=say)
         else:
@@ -96,24 +92,6 @@ def _resume(settings: Settings) -> None:
     with open_store(settings.database_url) as store:
         sent = sweep(store, _send(), all_pending=True)
     print(f"sent {sent} keyframes to the workers" if sent else "nothing is left to send")
-
-
-@contextlib.contextmanager
-def _terminable() -> Iterator[None]:
-    """SIGTERM ends the command as Ctrl-C does: what is under way is finished, the rest given back; exit code 143."""
-
-    def end(_number: int, _frame: object) -> None:
-        print("semdb: terminated", file=sys.stderr)
-        raise SystemExit(128 + signal.SIGTERM)
-
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, end)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def queued_text(summary: IngestSummary) -> str:
