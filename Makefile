@@ -1,6 +1,6 @@
 # make demo   install the base into .venv and run the demonstration (no setting, no model file needed)
 # make test   install everything, MariaDB included, then lint, types and all tests
-# make test-train   train a small detector on rendered rooms from random weights; 13 minutes of processor time
+# make test-train   train a small detector on rendered rooms from random weights; 8 minutes on 2 cores
 # make lint   ruff and mypy            make lock    write requirements/constraints.txt anew
 # make bench  all benchmarks, on RECORDINGS="..." or a rendered room
 # make wheel  dist/*.whl               make clean   remove what make made
