@@ -163,27 +163,21 @@ def project(camera: Camera, points: npt.ArrayLike) -> FloatArray:
     return normalized_to_pixels(camera, xy)
 
 
-def _distort(
-    coefficients: tuple[float, ...], x: FloatArray, y: FloatArray
-) -> tuple[FloatArray, FloatArray, tuple[FloatArray, FloatArray, FloatArray]]:
-    """Distorted coordinates and their Jacobian (dxx, dxy = dyx, dyy), each ``[n]``."""
+def _distort(coefficients: tuple[float, ...], x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Distorted coordinates, each ``[n]``."""
     k1, k2, p1, p2, k3 = (*coefficients, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # d radial / d x = slope * x
     xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
     yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    dxx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
-    dxy = slope * x * y + 2 * p1 * x + 2 * p2 * y
-    dyy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
-    return xd, yd, (dxx, dxy, dyy)
+    return xd, yd
 
 
 def normalized_to_pixels(camera: Camera, xy: FloatArray) -> FloatArray:
     """Pixels ``[n, 2]`` of undistorted normalised coordinates ``[n, 2]`` (OpenCV's distortion model)."""
     x, y = xy[:, 0], xy[:, 1]
     if any(camera.distortion):
-        x, y, _ = _distort(camera.distortion, x, y)
+        x, y = _distort(camera.distortion, x, y)
     return np.stack([camera.fx * x + camera.cx, camera.fy * y + camera.cy], axis=1)
 
 

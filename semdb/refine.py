@@ -22,10 +22,10 @@ from semdb.errors import DatabaseError, NotFoundError, UsageError
 from semdb.fusion.options import FusionOptions
 from semdb.geometry import transform_points
 from semdb.localization.confusion import ConfusionOptions, PlacedObjects, co_detections, confusions
+from semdb.localization.keyframe_cache import POINTS
 from semdb.localization.views import ClassNumbers, View, make_view
 
 CLASSES = "classes"
-POINTS = "points"
 READ_CHUNK = 50
 ATTEMPTS = 3  # of a step while the map changes under it
 Progress = Callable[[str, int, int], None]  # what, done, total

@@ -53,8 +53,8 @@ def align_pairs(
         if query.grey is None or view.grey is None or not len(here):
             continue
         chosen = keypoints[here]
-        warp = _warps(query, view, chosen, adjusted, slot + 1)
-        step = np.clip(view.size[chosen].astype(np.float64) / SIZE_PER_SAMPLE, 1.0, MOST_PIXELS_PER_SAMPLE)
+        relative = adjusted.image_from_world[QUERY] @ invert_pose(adjusted.image_from_world[slot + 1])
+        warp, step = patch_warps(query, view, chosen, relative), patch_steps(view, chosen)
         answer, likeness = np.zeros((len(here), 2)), np.empty(len(here))
         at = view.seen_xy[chosen].astype(np.float64)
         align_patches(view.grey, query.grey, at, warp, step, seen[here], answer, likeness)
@@ -66,9 +66,16 @@ def align_pairs(
     return Alignment(np.where(found[:, None], xy, query.xy[rows]), found)
 
 
-def _warps(query: View, view: View, chosen: IntArray, adjusted: BundleResult, image: int) -> FloatArray:
-    """Offsets in the keyframe to offsets in the query ``[n, 2, 2]``, for surfaces that face the keyframe."""
-    relative = adjusted.image_from_world[QUERY] @ invert_pose(adjusted.image_from_world[image])
+def patch_steps(view: View, chosen: IntArray) -> FloatArray:
+    """Pixels between the samples of the patches of a view's keypoints ``[n]``."""
+    return np.clip(view.size[chosen].astype(np.float64) / SIZE_PER_SAMPLE, 1.0, MOST_PIXELS_PER_SAMPLE)
+
+
+def patch_warps(query: View, view: View, chosen: IntArray, relative: FloatArray) -> FloatArray:
+    """Offsets in the keyframe to offsets in the query ``[n, 2, 2]``, for surfaces that face the keyframe.
+
+    `relative` ``[4, 4]`` moves points from the keyframe's camera frame to the query's.
+    """
     points = view.points[chosen].astype(np.float64)
     moved = transform_points(relative, points)
     x, y, z = moved.T

@@ -10,8 +10,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from semdb.geometry import invert_pose, transform_points
-from semdb.localization.alignment import MOST_PIXELS_PER_SAMPLE, SIZE_PER_SAMPLE
+from semdb.geometry import invert_pose
+from semdb.localization.alignment import patch_steps, patch_warps
 from semdb.localization.views import KeyframeView, View
 from semdb.types import FloatArray, ImageArray, IntArray
 
@@ -59,14 +59,7 @@ class _Patches:
     ) -> None:
         view = keyframe.view
         relative = invert_pose(world_from_camera) @ keyframe.world_from_camera
-        points = view.points[rows].astype(np.float64)
-        x, y, z = transform_points(relative, points).T
-        project = np.zeros((len(rows), 2, 3))
-        project[:, 0, 0] = project[:, 1, 1] = 1 / z
-        project[:, 0, 2], project[:, 1, 2] = -x / z**2, -y / z**2
-        scale = points[:, 2] * query.focal / view.focal
-        self.warp = np.ascontiguousarray(project @ relative[:3, :2] * scale[:, None, None])
-        self.step = np.clip(view.size[rows].astype(np.float64) / SIZE_PER_SAMPLE, 1.0, MOST_PIXELS_PER_SAMPLE)
+        self.warp, self.step = patch_warps(query, view, rows, relative), patch_steps(view, rows)
         self.at, self.guess = view.seen_xy[rows].astype(np.float64), np.ascontiguousarray(pixels, np.float64)
 
     def compare(self, own: ImageArray, other: ImageArray) -> tuple[FloatArray, FloatArray]:
