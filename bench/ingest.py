@@ -151,8 +151,9 @@ def _in_turn(recording: Recording, store: Store, describers: list[Describer], en
     idle: SimpleQueue[Describer] = SimpleQueue()
     idle.put(describers[0])
     key = summary.recording_id
-    for item in _claims(recording, key, store, "bench", 5, None, lambda: False, 60):
-        done: Item = _store(store, key, _describe(idle, _read(recording, item)))
+    for [item] in _claims(recording, key, store, "bench", (5, 1), None, lambda: False, 60):
+        [described] = _describe(idle, [_read(recording, item)])
+        done: Item = _store(store, key, described)
         assert done.created
     store.finish_recording(key)
 

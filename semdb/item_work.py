@@ -1,12 +1,14 @@
 """Working off the keyframes of a planned recording: what `semdb ingest` and every worker of a fleet do.
 
 Keyframes are claimed in the database a few at a time, decoded, described and stored in stages that overlap, each
-stored in one transaction that checks the claim. See `semdb.database.items` for what a claim is.
+stored in one transaction that checks the claim. See `semdb.database.items` for what a claim is. Those that go through
+the networks at once go through all stages together.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
 import sys
 import threading
 import time
@@ -16,14 +18,22 @@ from queue import SimpleQueue
 from typing import Any
 
 import cv2
+import numpy as np
 
 from semdb.database import items
 from semdb.database.items import Claim
 from semdb.database.records import KeyframeRecord
 from semdb.database.store import Store
-from semdb.errors import DatabaseError, FrameError, LeaseLostError, RecordingUnavailableError, UsageError
+from semdb.errors import (
+    DatabaseError,
+    FrameError,
+    LeaseLostError,
+    ModelError,
+    RecordingUnavailableError,
+    UsageError,
+)
 from semdb.events import event
-from semdb.perception.describe import Describer
+from semdb.perception.describe import Describer, View
 from semdb.pipeline import Stage, overlapped
 from semdb.recordings.base import FrameEntry, Recording
 from semdb.types import Description, Frame
@@ -72,24 +82,27 @@ def work_off(
     """Claims keyframes of `recording`, of `frames` where given, and stores them; yields each when it is done.
 
     Ends when none is left that nobody else works on, or soon after `stop` says so: what is under way is finished,
-    what is not begun is given back. Each of `describers` works in a thread of its own. A frame that cannot be read or
-    described is `failed`, and the rest goes on. Raises RecordingUnavailableError when the recording's folder is gone,
-    NotFoundError when the recording is deleted, ProvenanceError, ModelError, DatabaseError.
+    what is not begun is given back. Each of `describers` works in a thread of its own, on as many keyframes at once as
+    its `batch` says; fewer are not kept waiting. A frame that cannot be read or described is `failed`, and the rest
+    goes on. Raises RecordingUnavailableError when the recording's folder is gone, NotFoundError when the recording is
+    deleted, ProvenanceError, ModelError, DatabaseError.
     """
     worker = items.worker_name()
-    batch = 2 * len(describers) + 1
+    batch = describers[0].batch
+    batches = math.ceil((2 * len(describers) + 1) / batch)  # of one claim: all are busy, and others get theirs
     idle: SimpleQueue[Describer] = SimpleQueue()
     for describer in describers:
         idle.put(describer)
     stages = (
-        Stage("read", lambda item: _read(recording, item)),
-        Stage("describe", lambda item: _describe(idle, item), len(describers)),
-        Stage("store", lambda item: _store(store, recording_id, item, descriptor_dtype)),
+        Stage("read", lambda group: [_read(recording, item) for item in group]),
+        Stage("describe", lambda group: _describe(idle, group), len(describers)),
+        Stage("store", lambda group: [_store(store, recording_id, item, descriptor_dtype) for item in group]),
     )
-    claimed = _claims(recording, recording_id, store, worker, batch, frames, stop, lease_s)
+    claimed = _claims(recording, recording_id, store, worker, (batches, batch), frames, stop, lease_s)
     with _Renewal(store, recording_id, worker, lease_s), side_by_side():
         try:
-            yield from overlapped(claimed, stages, window=batch + 2)
+            for group in overlapped(claimed, stages, window=max(batches, len(describers)) + 2):
+                yield from group
         finally:
             items.release(store.engine, recording_id, worker)
 
@@ -99,21 +112,39 @@ def _claims(
     recording_id: int,
     store: Store,
     worker: str,
-    batch: int,
+    size: tuple[int, int],
     frames: Sequence[int] | None,
     stop: Callable[[], bool],
     lease_s: int,
-) -> Iterator[Item]:
+) -> Iterator[list[Item]]:
+    """Keyframes that this worker has claimed, in batches; `size` is how many of them a claim is for, and how large."""
     entries = {entry.index: entry for entry in recording.entries}
     items.release_dead(store.engine, recording_id)
     while not stop():
-        claims = items.claim(store.engine, recording_id, worker, limit=batch, frames=frames, lease_s=lease_s)
+        claims = items.claim(
+            store.engine, recording_id, worker, limit=size[0] * size[1], frames=frames, lease_s=lease_s
+        )
         if not claims:
             return
-        for claim in claims:
+        for group in _in_batches(claims, size[1]):
             if stop():
                 return
-            yield Item(claim, entries.get(claim.frame_index))
+            yield [Item(claim, entries.get(claim.frame_index)) for claim in group]
+
+
+def _in_batches(claims: Sequence[Claim], batch: int) -> Iterator[list[Claim]]:
+    """`claims` in their order, at most `batch` at once. One that was claimed before is alone: it may have been what
+    ended the worker that had it, and would take its neighbours along each time.
+    """
+    group: list[Claim] = []
+    for claim in claims:
+        alone = claim.token > 1
+        if group and (alone or len(group) == batch or group[-1].token > 1):
+            yield group
+            group = []
+        group.append(claim)
+    if group:
+        yield group
 
 
 _running, _running_lock, _before = 0, threading.Lock(), (0, 0.0)
@@ -182,23 +213,64 @@ def _read(recording: Recording, item: Item) -> Item:
     return item
 
 
-def _describe(idle: SimpleQueue[Describer], item: Item) -> Item:
-    frame = item.frame
-    if frame is None:
-        return item
-    if frame.world_from_camera is None:
-        raise UsageError(f"{frame.name} has no pose, so it cannot be a keyframe")
+def _describe(idle: SimpleQueue[Describer], group: list[Item]) -> list[Item]:
+    """Those of `group` that could be read go through the networks at once; where that fails, one by one."""
+    read = [(item, item.frame) for item in group if item.frame is not None]
+    for _, frame in read:
+        if frame.world_from_camera is None:
+            raise UsageError(f"{frame.name} has no pose, so it cannot be a keyframe")
     describer = idle.get()
     try:
-        item.description = describer.describe(frame.image, frame.depth, frame.camera, frame.instances)
-    except FrameError as error:
-        item.error = f"{frame.name}: {error}"
-        return item
+        if len(read) > 1 and _describe_at_once(describer, read):
+            return group
+        for item, frame in read:
+            _describe_alone(describer, item, frame)
     finally:
         idle.put(describer)
-    for stage, milliseconds in item.description.timing_ms.items():
+    return group
+
+
+def _describe_at_once(describer: Describer, read: Sequence[tuple[Item, Frame]]) -> bool:
+    """Whether all could be described: of what goes wrong with a batch nobody knows which frame it was."""
+    views = [View(frame.image, frame.depth, frame.camera, frame.instances) for _, frame in read]
+    try:
+        found = describer.describe_batch(views)
+    except (FrameError, ModelError) as error:
+        event("one_by_one", frames=len(views), error=str(error))
+        return False
+    for (item, _), description in zip(read, found, strict=True):
+        _take(item, description)
+    return True
+
+
+def _describe_alone(describer: Describer, item: Item, frame: Frame) -> None:
+    """Raises ModelError when it is the networks that fail, and not this frame that they fail on."""
+    try:
+        description = describer.describe(frame.image, frame.depth, frame.camera, frame.instances)
+    except FrameError as error:
+        item.error = f"{frame.name}: {error}"
+    except ModelError as error:
+        if not _works(describer, frame):
+            raise
+        item.error = f"{frame.name}: {error}"
+    else:
+        _take(item, description)
+
+
+def _works(describer: Describer, like: Frame) -> bool:
+    """Whether `describer` can describe noise of the size of a frame."""
+    noise = np.random.default_rng(0).integers(0, 256, like.image.shape, dtype=np.uint8)
+    try:
+        describer.describe(noise, None, like.camera, like.instances)
+    except ModelError:
+        return False
+    return True
+
+
+def _take(item: Item, description: Description) -> None:
+    item.description = description
+    for stage, milliseconds in description.timing_ms.items():
         item.seconds[stage] = milliseconds / 1000
-    return item
 
 
 def _store(store: Store, recording_id: int, item: Item, descriptor_dtype: str = "float32") -> Item:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -31,6 +31,9 @@ class Settings(BaseSettings):
         "auto",
         pattern=r"^(auto|cpu|mps|cuda(:\d+)?)$",
         description="device of the networks: auto, cpu, cuda, cuda:1, mps",
+    )
+    batch: Literal["auto"] | Annotated[int, Field(ge=1, le=64)] = Field(
+        "auto", description="images that go through the networks at once in an ingest. auto: 8 on a GPU, 1 on a CPU"
     )
     classes: str | None = Field(None, description="only objects of these classes: names, indoor, or all")
     dynamic: str | None = Field(None, description="classes of objects that move: no feature lies on them; or none")

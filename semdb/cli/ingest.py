@@ -34,6 +34,10 @@ def command(
         int | None, typer.Option("--stride", metavar="N", help="Every N-th usable frame instead of a selection.")
     ] = None,
     camera: CameraOption = None,
+    batch: Annotated[
+        str | None,
+        typer.Option("--batch", metavar="N", help="Images at once through the networks; over SEMDB_BATCH."),
+    ] = None,
     queue: Annotated[
         bool, typer.Option("--queue", help="Plan here, and let workers do it: see semdb.workers.")
     ] = False,
@@ -50,7 +54,7 @@ def command(
     from semdb.ingest import IngestOptions, ingest_recordings
     from semdb.queueing import queue_recordings
 
-    settings = overrides.settings()
+    settings = overrides.settings(batch=batch)
     if settings.log_format == "json":
         log_to()
     if resume and not paths:

@@ -78,9 +78,12 @@ class Overrides:
     classes: str | None = None
     dynamic: str | None = None
 
-    def settings(self) -> Settings:
-        """Settings of the environment under these options. Raises `UsageError` naming the variable or option."""
-        given = {field.name: getattr(self, field.name) for field in fields(self)}
+    def settings(self, **more: object) -> Settings:
+        """Settings of the environment under these options, and `more` of the command's own where they are not None.
+
+        Raises `UsageError` naming the variable or option.
+        """
+        given = {field.name: getattr(self, field.name) for field in fields(self)} | more
         if self.database_url is not None:
             from semdb.cli.secrets import hide_password
 

@@ -42,7 +42,7 @@ class Describers:
 
             first = self._made[self._default]
             self._made[name] = Describer(
-                first.detector, first.encoder, load_features(name, self._settings), first.rules
+                first.detector, first.encoder, load_features(name, self._settings), first.rules, first.batch
             )
         return self._made[name]
 

@@ -35,7 +35,12 @@ class Detector(Protocol):
 
 @runtime_checkable
 class BatchDetector(Detector, Protocol):
-    """A detector that is faster on several images at once."""
+    """A detector that takes several images at once."""
+
+    @property
+    def best_batch(self) -> int:
+        """With how many images at once it is fastest where it runs."""
+        ...
 
     def detect_batch(self, images: Sequence[ImageArray]) -> list[tuple[Detection, ...]]:
         """What `detect` finds in each of `images`, within rounding. Raises ModelError."""
@@ -58,7 +63,12 @@ class Encoder(Protocol):
 
 @runtime_checkable
 class BatchEncoder(Encoder, Protocol):
-    """An encoder that is faster on several images at once."""
+    """An encoder that takes several images at once."""
+
+    @property
+    def best_batch(self) -> int:
+        """With how many images at once it is fastest where it runs."""
+        ...
 
     def encode_batch(self, images: Sequence[ImageArray]) -> Float32Array:
         """The vectors ``[n, d]`` of `images`, each as `encode` gives it, within rounding. Raises ModelError."""

@@ -16,6 +16,7 @@ from semdb.perception.detectors.onnx import MASK_THRESHOLD, NO_MASK, WEAK_THRESH
 from semdb.perception.mask_rcnn import Architecture
 from semdb.perception.model_files import canonical_json, file_sha256, first_line
 from semdb.perception.torch_models import (
+    best_batch,
     import_torch,
     layer_precision,
     prepare,
@@ -53,6 +54,7 @@ class TorchvisionDetector:
         self._score_threshold = settings.score_threshold
         self._network = prepare(network, settings, self._torch)
         self._device = next(self._network.parameters()).device
+        self.best_batch = best_batch(self._device)
         self._path = path
         config = {
             "architecture": self.architecture.name,

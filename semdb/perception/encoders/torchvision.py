@@ -14,6 +14,7 @@ from semdb.perception.catalogue import BY_NAME
 from semdb.perception.encoders.onnx import CROP, SHORT_SIDE, centre_batch, unit_vector
 from semdb.perception.model_files import canonical_json, file_sha256, first_line
 from semdb.perception.torch_models import (
+    best_batch,
     import_torch,
     layer_precision,
     load_weights,
@@ -46,6 +47,7 @@ class TorchvisionEncoder:
         network = load_encoder_checkpoint(path, expected_outputs(spec))
         self._network = prepare(network, settings, self._torch)
         self._device = next(self._network.parameters()).device
+        self.best_batch = best_batch(self._device)
         self._path = path
         config = canonical_json({"crop": CROP, "layer": "avgpool", "short_side": SHORT_SIDE})
         shown = name if name in BY_NAME else path.name
