@@ -25,25 +25,26 @@ from semdb.types import Camera, Float32Array
 # depth up to 5 m, a floor seen at 10 degrees changes by 1 % a pixel.
 MAX_STEP = 0.03
 TOLERANCE = np.float32(-1e-4)  # a pixel centre on the edge of two triangles belongs to one of them at least
+NONE, SEVERAL = np.int32(-1), np.int32(-2)  # how many pixels a triangle may see, where it is not one
 
 
 def register_seven_scenes(depth: Float32Array, camera: Camera) -> Float32Array:
     """Depth ``[480, 640]`` metres of the depth camera (NaN invalid) as seen by the colour `camera` ``[H, W]``."""
-    x, y, inverse_z, known = (np.empty(depth.shape, dtype=np.float32) for _ in range(4))
+    u, v, inverse_z, known = (np.empty(depth.shape, dtype=np.float32) for _ in range(4))
     shift = COLOR_FROM_DEPTH[:3, 3].astype(np.float32)
-    _transform(np.ascontiguousarray(depth, dtype=np.float32), _rotated_rays(), shift, x, y, inverse_z, known)
-    if any(camera.distortion):
-        pixels = normalized_to_pixels(camera, np.column_stack([x.ravel(), y.ravel()]).astype(np.float64))
+    distorted = any(camera.distortion)
+    lens = (1.0, 1.0, 0.0, 0.0) if distorted else (camera.fx, camera.fy, camera.cx, camera.cy)
+    fx, fy, cx, cy = (np.float32(number) for number in lens)
+    depth = np.ascontiguousarray(depth, dtype=np.float32)
+    _transform(depth, _rotated_rays(), shift, fx, fy, cx, cy, u, v, inverse_z, known)
+    if distorted:
+        pixels = normalized_to_pixels(camera, np.column_stack([u.ravel(), v.ravel()]).astype(np.float64))
         u = pixels[:, 0].reshape(depth.shape).astype(np.float32)
         v = pixels[:, 1].reshape(depth.shape).astype(np.float32)
-    else:
-        u = x * np.float32(camera.fx) + np.float32(camera.cx)
-        v = y * np.float32(camera.fy) + np.float32(camera.cy)
     nearest = np.zeros((camera.height, camera.width), dtype=np.float32)  # 1/z, 0 is nothing
     _rasterise(known, u, v, inverse_z, np.float32(MAX_STEP), nearest)
-    registered = np.full_like(nearest, np.nan)
-    np.divide(np.float32(1), nearest, out=registered, where=nearest > 0)
-    return registered
+    _invert(nearest)
+    return nearest
 
 
 @lru_cache(maxsize=1)
@@ -57,14 +58,18 @@ def _rotated_rays() -> Float32Array:  # [3, 480, 640]
 
 
 @kernel
-def _transform(depth, rays, shift, x, y, inverse_z, known):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Where each depth pixel is in the other camera: normalised x and y, and 1/z; `known` is `depth`, 0 for NaN."""
+def _transform(  # type: ignore[no-untyped-def]  # pragma: no cover
+    depth, rays, shift, fx, fy, cx, cy, u, v, inverse_z, known
+):
+    """Where each depth pixel is in the other camera, in pixels, and 1/z; `known` is `depth`, 0 for NaN."""
     for row in range(depth.shape[0]):
         for column in range(depth.shape[1]):
             d = depth[row, column]
             w = np.float32(1) / (d * rays[2, row, column] + shift[2])
-            x[row, column] = (d * rays[0, row, column] + shift[0]) * w
-            y[row, column] = (d * rays[1, row, column] + shift[1]) * w
+            x = (d * rays[0, row, column] + shift[0]) * w
+            y = (d * rays[1, row, column] + shift[1]) * w
+            u[row, column] = x * fx + cx
+            v[row, column] = y * fy + cy
             inverse_z[row, column] = w
             known[row, column] = d if d > 0 else np.float32(0)
 
@@ -73,22 +78,71 @@ def _transform(depth, rays, shift, x, y, inverse_z, known):  # type: ignore[no-u
 def _rasterise(depth, u, v, inverse_z, max_step, nearest):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Both triangles of each 2x2 block: the diagonal from top right to bottom left is shared."""
     rows, columns = depth.shape
+    flat = nearest.reshape(nearest.size)
+    place, value = np.empty(columns, np.int32), np.empty(columns, np.float32)
     for row in range(rows - 1):
-        for column in range(columns - 1):
-            for half in range(2):
-                r0, c0 = row + half, column + half
-                r1, c1 = row + half, column + 1 - half
-                r2, c2 = row + 1 - half, column + half
-                a, b, c = depth[r0, c0], depth[r1, c1], depth[r2, c2]
-                low, high = min(a, b, c), max(a, b, c)
-                if low <= 0 or high - low > max_step * low:
-                    continue  # a corner is not known, or they are not one surface
-                _triangle(
-                    u[r0, c0], v[r0, c0], inverse_z[r0, c0],
-                    u[r1, c1], v[r1, c1], inverse_z[r1, c1],
-                    u[r2, c2], v[r2, c2], inverse_z[r2, c2],
-                    nearest,
-                )  # fmt: skip
+        for half in range(2):
+            several = _triangles_of_row(depth, u, v, inverse_z, max_step, row, half, nearest.shape, place, value)
+            if several:
+                for c in range(columns - 1):
+                    if place[c] == SEVERAL:
+                        r0, c0 = row + half, c + half
+                        r1, c1 = row + half, c + 1 - half
+                        r2, c2 = row + 1 - half, c + half
+                        _triangle(
+                            u[r0, c0], v[r0, c0], inverse_z[r0, c0],
+                            u[r1, c1], v[r1, c1], inverse_z[r1, c1],
+                            u[r2, c2], v[r2, c2], inverse_z[r2, c2],
+                            nearest,
+                        )  # fmt: skip
+            found = 0
+            for c in range(columns - 1):  # whether a triangle has a pixel cannot be foreseen: no branch
+                place[found], value[found] = place[c], value[c]
+                found += place[c] >= 0
+            for k in range(found):
+                p = np.uintp(place[k])
+                flat[p] = max(flat[p], value[k])
+
+
+@kernel(fastmath={"contract"})
+def _triangles_of_row(  # type: ignore[no-untyped-def]  # pragma: no cover
+    depth, u, v, inverse_z, max_step, row, half, size, place, value
+):
+    """What `_triangle` does, for one triangle of each block of a row, many at a time: nearly all see at most one pixel.
+
+    Writes the flat index of that pixel to `place`, NONE where there is none, SEVERAL where there may be more, and its
+    1/z to `value`. Returns how many are SEVERAL. To the last bit as `_triangle` rounds: hence `contract` and no more, and
+    the sign of `share_c`.
+    """
+    height, width = size
+    last_x, last_y = np.float32(width - 1), np.float32(height - 1)
+    columns = depth.shape[1]
+    flat_depth, flat_u, flat_v, flat_w = depth.ravel(), u.ravel(), v.ravel(), inverse_z.ravel()
+    begin = row * columns + half
+    a, b = np.uintp(begin + half * columns), np.uintp(begin + half * columns + 1 - 2 * half)
+    c = np.uintp(begin + (1 - half) * columns)
+    several = 0
+    for k in range(columns - 1):
+        x = np.uintp(k)
+        ua, ub, uc = flat_u[a + x], flat_u[b + x], flat_u[c + x]
+        va, vb, vc = flat_v[a + x], flat_v[b + x], flat_v[c + x]
+        wa, wb, wc = flat_w[a + x], flat_w[b + x], flat_w[c + x]
+        low = min(flat_depth[a + x], flat_depth[b + x], flat_depth[c + x])
+        high = max(flat_depth[a + x], flat_depth[b + x], flat_depth[c + x])
+        area = (ub - ua) * (vc - va) - (vb - va) * (uc - ua)
+        left, right = max(np.float32(0), np.ceil(min(ua, ub, uc))), min(last_x, np.floor(max(ua, ub, uc)))
+        top, bottom = max(np.float32(0), np.ceil(min(va, vb, vc))), min(last_y, np.floor(max(va, vb, vc)))
+        used = (low > 0) & (high - low <= max_step * low) & (area > 0) & (left <= right) & (top <= bottom)
+        single = (left == right) & (top == bottom)
+        dx, dy = left - ua, top - va
+        share_b = (dx * (vc - va) - dy * (uc - ua)) * (np.float32(1) / area)
+        share_c = ((vb - va) * dx - (ub - ua) * dy) * (np.float32(-1) / area)
+        inside = (min(share_b, share_c) >= TOLERANCE) & (share_b + share_c <= np.float32(1) - TOLERANCE)
+        value[x] = wa + share_b * (wb - wa) + share_c * (wc - wa)
+        pixel = np.int32(np.int32(np.int32(top) * np.int32(width)) + np.int32(left))
+        place[x] = (pixel if inside else NONE) if used & single else (SEVERAL if used else NONE)
+        several += used & ~single
+    return several
 
 
 @kernel(fastmath=True, inline="always")
@@ -112,3 +166,12 @@ def _triangle(ua, va, wa, ub, vb, wb, uc, vc, wc, nearest):  # type: ignore[no-u
                 continue
             w = wa + share_b * (wb - wa) + share_c * (wc - wa)
             nearest[y, x] = max(nearest[y, x], w)
+
+
+@kernel
+def _invert(nearest):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """1/z becomes z, what is not known NaN."""
+    for row in range(nearest.shape[0]):
+        for column in range(nearest.shape[1]):
+            w = nearest[row, column]
+            nearest[row, column] = np.float32(1) / w if w > 0 else np.float32(np.nan)
