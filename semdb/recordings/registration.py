@@ -111,8 +111,8 @@ def _triangles_of_row(  # type: ignore[no-untyped-def]  # pragma: no cover
     """What `_triangle` does, for one triangle of each block of a row, many at a time: nearly all see at most one pixel.
 
     Writes the flat index of that pixel to `place`, NONE where there is none, SEVERAL where there may be more, and its
-    1/z to `value`. Returns how many are SEVERAL. To the last bit as `_triangle` rounds: hence `contract` and no more, and
-    the sign of `share_c`.
+    1/z to `value`. Returns how many are SEVERAL. Rounds as `_triangle` does to the last bit:
+    hence `contract` and no more, and the sign of `share_c`.
     """
     height, width = size
     last_x, last_y = np.float32(width - 1), np.float32(height - 1)
