@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from semdb.geometry import invert_pose, pose_distances
 from semdb.types import Float32Array, FloatArray, IntArray
 
 CAUCHY_SQUARED = 4.0  # (2 sigma)^2: where the loss leaves the parabola
@@ -34,6 +35,7 @@ LEAST_STEP = 2e-5  # m and rad, of the query
 NORMAL_MEDIAN = 1.4826  # a normal distribution's standard deviation over its median distance
 IGNORED = 1e6  # times the noise: no weight
 FIXED = 1e-7  # a standard deviation (m, rad) that nothing moves
+LEAST_DISTANCE = 0.02  # of a keyframe from the query (`pose_distances`), for the prior on its pose
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,12 +43,13 @@ class MotionPrior:
     """Standard deviations, the greatest that are believed: what the images show decides (see `adjust`).
 
     `turn_rad`: rotation during the readout, 0.02 rad being 35 degrees a second over 33 ms. `keyframe_m` and
-    `keyframe_rad`: error of a keyframe's recorded pose. The least are what is left of them when nothing is seen.
+    `keyframe_rad`: error of a keyframe's recorded pose against one at a distance of 1 (`pose_distances`: 0.3 m or 15
+    degrees); it grows with the root of the distance. The least are what is left of them when nothing is seen.
     """
 
     turn_rad: float = 0.02
-    keyframe_m: float = 0.002
-    keyframe_rad: float = 0.001
+    keyframe_m: float = 0.006
+    keyframe_rad: float = 0.003
     least_turn_rad: float = 0.0003
     least_keyframe_m: float = 0.0002
     least_keyframe_rad: float = 0.0002
@@ -123,6 +126,25 @@ class _Solver:
         self.first = np.searchsorted(problem.observed_point, bounds).astype(np.int32)
         self.images = len(problem.keyframe_from_world) + 1
         self.information = np.zeros((self.images, 9))  # of the priors
+        self.drift = np.ones((self.images, 9))  # how many times the priors' sigma each unknown has
+
+    def drifting(self, camera_from_world: FloatArray) -> None:
+        """Poses of a trajectory drift apart as in a random walk: a keyframe's variance grows with its distance from
+        the query. So the near ones hold the query, and of two with the query between them each as its place is.
+        """
+        keyframes = np.stack([invert_pose(pose) for pose in self.problem.keyframe_from_world])
+        distance = pose_distances(invert_pose(camera_from_world), keyframes)
+        self.drift[1:, :6] = np.sqrt(np.maximum(distance, LEAST_DISTANCE))[:, None]
+
+    def believe(self, sigma: FloatArray) -> None:
+        """Makes `sigma` ``[3]`` (shift, rotation, turn of an image) those of the priors. The query's pose has none."""
+        self.information = self.information_of(sigma)
+
+    def information_of(self, sigma: FloatArray) -> FloatArray:
+        """Information ``[c, 9]`` of priors of `sigma`, as in `believe`."""
+        information = 1 / np.maximum(np.repeat(sigma, 3) * self.drift, FIXED) ** 2
+        information[QUERY, :6] = 0.0
+        return information
 
     def linearise(self, state: _State) -> _Blocks:
         from semdb.localization.bundle_kernels import normal_equations
@@ -240,14 +262,15 @@ def adjust(
         state = _State(start.image_from_world, start.turn, start.shift, problem.points)
     greatest = np.array([prior.keyframe_m, prior.keyframe_rad, prior.turn_rad])
     least = np.minimum(greatest, [prior.least_keyframe_m, prior.least_keyframe_rad, prior.least_turn_rad])
-    solver.information = _information(greatest, count)
+    solver.drifting(camera_from_world)
+    solver.believe(greatest)
     solver.observed[problem.observed_image == QUERY, 5] = IGNORED
     state, blocks, iterations = solver.minimise(state, FIRST_ITERATIONS)
     if rough:
         return _result(state, blocks, iterations, None)
     solver.believe_depth(state)
     sigma = _evident_sigma(solver, state, blocks, least, greatest)
-    solver.information = _information(sigma, count)
+    solver.believe(sigma)
     state, blocks, more = solver.minimise(state, max_iterations)
     shown = 1 - (least / np.maximum(sigma, FIXED)) ** 2  # what is least is not known to be there at all
     covariance = _covariance(solver, blocks, state.poses[QUERY], np.tile(np.repeat(shown, 3), count))
@@ -267,37 +290,30 @@ def _result(state: _State, blocks: _Blocks, iterations: int, covariance: FloatAr
     )
 
 
-def _information(sigma: FloatArray, images: int) -> FloatArray:
-    """Information ``[c, 9]`` of the priors. The query's pose has none."""
-    information = np.tile(np.repeat(1 / np.maximum(sigma, FIXED) ** 2, 3), (images, 1))
-    information[QUERY, :6] = 0.0
-    return information
-
-
 def _evident_sigma(
     solver: _Solver, state: _State, blocks: _Blocks, least: FloatArray, greatest: FloatArray
 ) -> FloatArray:
     """Standard deviation ``[3]`` of the keyframes' shifts, of their rotations and of all turns, from a solution.
 
-    The sum of their squares over how many of them the images, not the priors, determine; iterated on the
+    Those of a keyframe at a distance of 1. The sum of their squares over how many of them the images, not the priors, determine; iterated on the
     equations of the solution, which are those of the priors `greatest`.
     """
     reduced, gradient = solver.reduced(blocks, 0.0)
     offset = np.concatenate([state.shift, state.turn], axis=1).reshape(-1)
-    old = solver.information.reshape(-1)
+    old, drift = solver.information.reshape(-1), solver.drift.reshape(-1)
     data = reduced - np.diag(old)
     pull = data @ offset - (gradient - old * offset)
     kinds = np.tile(np.repeat(np.arange(3), 3), solver.images)
     groups = [np.flatnonzero((kinds == kind) & (old > 0)) for kind in range(3)]
     sigma = greatest
     for _ in range(EVIDENCE_ROUNDS):
-        information = _information(sigma, solver.images).reshape(-1)
+        information = solver.information_of(sigma).reshape(-1)
         inverse = np.linalg.inv(data + np.diag(information))
         mean, variance = inverse @ pull, np.diag(inverse)
         found = np.empty(3)
         for kind, members in enumerate(groups):
             determined = float((1 - variance[members] * information[members]).sum())
-            found[kind] = np.sqrt((mean[members] ** 2).sum() / max(determined, 1e-6))
+            found[kind] = np.sqrt(((mean[members] / drift[members]) ** 2).sum() / max(determined, 1e-6))
         found = np.clip(found, least, greatest)
         if np.abs(found - sigma).max() < 0.05 * float(np.abs(sigma).max()):
             return found

@@ -51,7 +51,7 @@ class LocalizerOptions:
     coarse: CoarseOptions = field(default_factory=CoarseOptions)
     pose: PoseOptions = field(default_factory=PoseOptions)
     verdict: VerdictOptions = field(default_factory=VerdictOptions)
-    neighbours: int = 1  # keyframes near the first pose that join once it convinces
+    neighbours: int = 2  # keyframes near the first pose that join once it convinces
     twins: int = 1  # keyframes far from the pose that are asked when they look as much like the query
     refined_points: bool = True  # those of `semdb refine`, where the map has not changed since
     twin_cosine: float = 0.05  # how much less than the best keyframe's cosine is "as much"

@@ -24,12 +24,16 @@ def problem_of(
     keyframes: int = 1,
     keyframe_error: float = 0.0,
     pixel_noise: float = 0.0,
+    apart: tuple[float, ...] | None = None,
 ) -> tuple[BundleProblem, FloatArray]:
-    """A query and keyframes that see `count` points, images turning by `turns` ``[c, 3]``; the true query pose."""
+    """A query and keyframes that see `count` points, images turning by `turns` ``[c, 3]``; the true query pose.
+
+    Images are 0.1 m and 0.08 rad per axis from the middle, or as many times that as `apart` says of each; keyframes'
+    recorded positions are off by `keyframe_error` m times the root of that.
+    """
     random = np.random.default_rng(seed)
-    truth = [
-        pose_from(so3_exp(random.normal(size=3) * 0.08), random.normal(size=3) * 0.1) for _ in range(keyframes + 1)
-    ]
+    apart = apart or (1.0,) * (keyframes + 1)
+    truth = [pose_from(so3_exp(random.normal(size=3) * 0.08 * far), random.normal(size=3) * 0.1 * far) for far in apart]
     points = random.uniform([-1.2, -0.9, 1.5], [1.2, 0.9, 4], (count, 3))
     turns = np.zeros((keyframes + 1, 3)) if turns is None else turns
     owner, image, seen = [], [], []
@@ -46,7 +50,10 @@ def problem_of(
         image.append(np.full(count, n))
     observed, point = np.concatenate(seen), np.concatenate(owner)
     order = np.argsort(point, kind="stable")
-    recorded = [pose_from(pose[:3, :3], pose[:3, 3] + random.normal(size=3) * keyframe_error) for pose in truth[1:]]
+    recorded = [
+        pose_from(pose[:3, :3], pose[:3, 3] + random.normal(size=3) * keyframe_error * np.sqrt(far))
+        for pose, far in zip(truth[1:], apart[1:], strict=True)
+    ]
     problem = BundleProblem(
         points=points + random.normal(size=points.shape) * 0.005,
         observed_point=point[order].astype(np.int32),
@@ -142,6 +149,18 @@ def test_a_keyframe_whose_pose_is_off_is_moved_to_the_others() -> None:
         errors.append(error_of(problem, truth)[0])
         still.append(error_of(problem, truth, STILL)[0])
     assert np.mean(errors) < 0.95 * np.mean(still)
+
+
+def test_a_keyframe_near_the_query_holds_it_more_than_one_far_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Recorded poses drift apart: of two keyframes, one five times as far from the query, the near one is to count."""
+    problems = [
+        problem_of(seed, keyframes=2, keyframe_error=0.006, pixel_noise=0.3, apart=(0.0, 0.5, 2.5))
+        for seed in range(30)
+    ]
+    errors = [error_of(problem, truth)[0] for problem, truth in problems]
+    monkeypatch.setattr(_Solver, "drifting", lambda solver, pose: None)
+    alike = [error_of(problem, truth)[0] for problem, truth in problems]
+    assert np.mean(errors) < 0.9 * np.mean(alike)
 
 
 def test_depth_that_disagrees_is_believed_less() -> None:
