@@ -295,8 +295,8 @@ def _evident_sigma(
 ) -> FloatArray:
     """Standard deviation ``[3]`` of the keyframes' shifts, of their rotations and of all turns, from a solution.
 
-    Those of a keyframe at a distance of 1. The sum of their squares over how many of them the images, not the priors, determine; iterated on the
-    equations of the solution, which are those of the priors `greatest`.
+    Those of a keyframe at a distance of 1. The sum of their squares over how many of them the images, not the priors,
+    determine; iterated on the equations of the solution, which are those of the priors `greatest`.
     """
     reduced, gradient = solver.reduced(blocks, 0.0)
     offset = np.concatenate([state.shift, state.turn], axis=1).reshape(-1)
