@@ -100,9 +100,14 @@ def _jump(z, other, step):  # type: ignore[no-untyped-def]  # pragma: no cover
 @kernel
 def count_labels(labels, counts):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Adds to `counts` ``[n]`` how many pixels of `labels` int32 ``[h, w]`` have each of 0 to n - 1."""
-    for row in range(labels.shape[0]):
-        for column in range(labels.shape[1]):
-            counts[labels[row, column]] += 1
+    rows, columns = labels.shape
+    for row in range(rows):
+        begin, label = 0, labels[row, 0]
+        for column in range(1, columns):  # runs: a count that each pixel raises waits for itself
+            if labels[row, column] != label:
+                counts[label] += column - begin
+                begin, label = column, labels[row, column]
+        counts[label] += columns - begin
 
 
 @kernel
@@ -119,24 +124,19 @@ def of_label(labels, depth, top, left, label, out):  # type: ignore[no-untyped-d
 @kernel
 def within(mask, depth, top, left, nearest, farthest, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Writes `mask` without its known pixels before `nearest` or behind `farthest` to `out` bool ``[h, w]``."""
-    limit = np.float32(np.inf)
-    for row in range(mask.shape[0]):
-        for column in range(mask.shape[1]):
-            z = depth[top + row, left + column]
-            far = z > 0 and z < limit and (z < nearest or z > farthest)
-            out[row, column] = mask[row, column] and not far
+    rows, columns = mask.shape
+    for row in range(rows):
+        here, line, target = depth[top + row, left : left + columns], mask[row], out[row]
+        for column in range(columns):  # without branches: several pixels at a time
+            z = here[column]
+            target[column] = line[column] & ~(_known(z) & ((z < nearest) | (z > farthest)))
 
 
 @kernel
-def known_pixels(mask, depth, top, left, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Writes the flat indexes (in `mask`) of its known pixels to `out` int64, in order. Returns how many there are."""
-    limit = np.float32(np.inf)
-    count = 0
+def mark_known(mask, depth, top, left, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Writes the known pixels of `mask` to `out` bool ``[h, w]``."""
     rows, columns = mask.shape
     for row in range(rows):
+        here, line, target = depth[top + row, left : left + columns], mask[row], out[row]
         for column in range(columns):
-            z = depth[top + row, left + column]
-            if mask[row, column] and z > 0 and z < limit:
-                out[count] = row * columns + column
-                count += 1
-    return count
+            target[column] = line[column] & _known(here[column])

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from semdb.errors import UsageError
+from semdb.perception._masks import bounding_box
 from semdb.perception.detectors.coco import INDOOR, NO_OBJECT
 from semdb.perception.model_files import canonical_json
 from semdb.perception.protocols import Detector
@@ -94,7 +95,7 @@ def clean_mask(detection: Detection, rules: MaskRules) -> Detection | None:
 
     A box changes only where its mask lost parts.
     """
-    x, y, w, h = cv2.boundingRect(detection.mask.view(np.uint8))
+    x, y, w, h = bounding_box(detection.mask)
     inside = np.ascontiguousarray(detection.mask[y : y + h, x : x + w])
     before = int(np.count_nonzero(inside))
     part = _main_parts(inside, rules.part_share)
@@ -105,7 +106,7 @@ def clean_mask(detection: Detection, rules: MaskRules) -> Detection | None:
         return detection
     mask = np.zeros_like(detection.mask)
     mask[y : y + h, x : x + w] = part
-    px, py, pw, ph = cv2.boundingRect(part.view(np.uint8))
+    px, py, pw, ph = bounding_box(part)
     limits = np.array([x + px, y + py, x + px + pw - 1, y + py + ph - 1], dtype=np.float32)
     old = detection.box
     box = np.concatenate([np.maximum(old[:2], limits[:2]), np.minimum(old[2:], limits[2:])]).astype(np.float32)
@@ -114,29 +115,50 @@ def clean_mask(detection: Detection, rules: MaskRules) -> Detection | None:
 
 def without_duplicates(detections: Sequence[Detection], rules: MaskRules) -> tuple[Detection, ...]:
     """`detections` by descending score, each object once (`MaskRules` says what is a duplicate); scores stay."""
-    kept: list[tuple[Detection, int]] = []
+    kept: list[_Region] = []
     for candidate in sorted(detections, key=lambda detection: -detection.score):
-        area = int(np.count_nonzero(candidate.mask))
-        if not any(_is_duplicate(candidate, area, *other, rules) for other in kept):
-            kept.append((candidate, area))
-    return tuple(detection for detection, _ in kept)
+        region = _region(candidate)
+        if not any(_is_duplicate(region, other, rules) for other in kept):
+            kept.append(region)
+    return tuple(region.detection for region in kept)
 
 
-def _is_duplicate(candidate: Detection, area: int, other: Detection, other_area: int, rules: MaskRules) -> bool:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Region:
+    """A detection, how many pixels its mask has, and the window that they lie in, its end not included."""
+
+    detection: Detection
+    area: int
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+
+def _region(detection: Detection) -> _Region:
+    x, y, w, h = bounding_box(detection.mask)
+    area = int(np.count_nonzero(detection.mask[y : y + h, x : x + w]))
+    return _Region(detection, area, x, y, x + w, y + h)
+
+
+def _is_duplicate(candidate: _Region, other: _Region, rules: MaskRules) -> bool:
     """Whether `candidate` is a second detection of what `other` is, which has at least its score."""
     common = _common_pixels(candidate, other)
     if common == 0:
         return False
-    same_class = candidate.category == other.category
-    if common >= rules.duplicate_iou * (area + other_area - common):
-        return same_class or candidate.score < rules.rival_share * other.score
-    return same_class and common >= rules.contained * area
+    same_class = candidate.detection.category == other.detection.category
+    if common >= rules.duplicate_iou * (candidate.area + other.area - common):
+        return same_class or candidate.detection.score < rules.rival_share * other.detection.score
+    return same_class and common >= rules.contained * candidate.area
 
 
-def _common_pixels(a: Detection, b: Detection) -> int:
-    if a.box[0] > b.box[2] + 1 or b.box[0] > a.box[2] + 1 or a.box[1] > b.box[3] + 1 or b.box[1] > a.box[3] + 1:
+def _common_pixels(a: _Region, b: _Region) -> int:
+    left, right = max(a.left, b.left), min(a.right, b.right)
+    top, bottom = max(a.top, b.top), min(a.bottom, b.bottom)
+    if left >= right or top >= bottom:
         return 0
-    return int(np.count_nonzero(a.mask & b.mask))
+    window = np.s_[top:bottom, left:right]
+    return int(np.count_nonzero(a.detection.mask[window] & b.detection.mask[window]))
 
 
 def _main_parts(mask: BoolArray, share: float) -> BoolArray:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 
+import cv2
 import numpy as np
 import pytest
 
 from semdb.errors import UsageError
 from semdb.model_choice import settings_of_map
 from semdb.perception.describe import Describer
+from semdb.perception._masks import bounding_box
 from semdb.perception.detections import DetectionRules, MaskRules, rules_of
 from semdb.perception.detectors.coco import COCO_91, INDOOR
 from semdb.perception.detectors.recorded import RecordedDetector
@@ -212,3 +214,12 @@ def test_no_feature_lies_on_a_dynamic_object_nor_does_it_count() -> None:
 
 def test_mask_rules_are_what_the_documentation_says() -> None:
     assert MaskRules() == MaskRules(0.3, 64, 0.1, 0.7, 0.8, 0.85)
+
+
+def test_the_box_about_a_mask_is_that_of_opencv() -> None:
+    generator = np.random.default_rng(3)
+    for share in (0, 0.002, 0.02, 0.9):
+        for height, width in ((1, 1), (7, 640), (33, 5), (48, 64)):
+            mask = generator.random((height, width)) < share
+            assert bounding_box(mask) == cv2.boundingRect(mask.view(np.uint8)), (share, height, width)
+    assert bounding_box(rectangle(10, 20, 30, 40)[::2, ::2]) == (5, 10, 15, 20)  # not contiguous
