@@ -10,8 +10,8 @@ import pytest
 
 from semdb.errors import UsageError
 from semdb.model_choice import settings_of_map
-from semdb.perception.describe import Describer
 from semdb.perception._masks import bounding_box
+from semdb.perception.describe import Describer
 from semdb.perception.detections import DetectionRules, MaskRules, rules_of
 from semdb.perception.detectors.coco import COCO_91, INDOOR
 from semdb.perception.detectors.recorded import RecordedDetector
