@@ -35,13 +35,17 @@ def picture(seed: int, height: int, width: int) -> np.ndarray:
     return np.mean(layers, axis=0).astype(np.uint8)
 
 
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A detector whose masks fill their boxes: random ones are near one half everywhere, where rounding counts."""
-    network = mask_rcnn(SMALL, len(CLASSES))
+def fill_boxes(network: Any) -> None:
+    """Makes masks fill their boxes: random ones are near one half everywhere, where rounding counts."""
     with torch.no_grad():
         network.roi_heads.mask_predictor.mask_fcn_logits.weight.mul_(0.1)
         network.roi_heads.mask_predictor.mask_fcn_logits.bias += 2
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    network = mask_rcnn(SMALL, len(CLASSES))
+    fill_boxes(network)
     content = {"format": "semdb-detector", "architecture": dataclasses.asdict(SMALL), "classes": list(CLASSES)}
     path = tmp_path_factory.mktemp("export") / "small.pth"
     torch.save({**content, "model": network.state_dict()}, path)
@@ -68,6 +72,23 @@ def test_detector_is_the_same_at_any_size(checkpoint: Path, exported: Exported) 
         assert found.score < 1e-3
         assert found.mask_iou > 0.99
         assert found.equal
+
+
+def test_resnet101_is_the_same(tmp_path: Path) -> None:
+    """The paper's backbone at a fifth of its size."""
+    architecture = Architecture("resnet101", min_size=160, max_size=320)
+    network = mask_rcnn(architecture, len(CLASSES))
+    fill_boxes(network)
+    content = {"format": "semdb-detector", "architecture": dataclasses.asdict(architecture), "classes": list(CLASSES)}
+    torch.save({**content, "model": network.state_dict()}, tmp_path / "r101.pth")
+    spec = f"torchvision:{tmp_path}/r101.pth"
+    done = export(spec, tmp_path / "r101.onnx", SETTINGS)
+    original, file = load_detector(spec, SETTINGS), load_detector(f"onnx:{done.path}", SETTINGS)
+    found = compare_detectors(original, file, [picture(1, 96, 128)], 0.5)
+    assert found.objects > 5
+    assert found.equal
+    assert found.box_px < 0.01
+    assert found.score < 1e-4
 
 
 def test_the_file_keeps_the_contract(checkpoint: Path, exported: Exported) -> None:

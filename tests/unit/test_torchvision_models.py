@@ -133,6 +133,31 @@ def test_a_checkpoint_by_path_is_recognised(backbone: str, tmp_path: Path) -> No
     assert json.loads(detector.info.config)["architecture"] == f"maskrcnn_{backbone}_fpn"
 
 
+def test_resnet101_gives_what_torchvision_gives(tmp_path: Path) -> None:
+    """The paper's backbone, which has no published file: the reference is built from torchvision's parts alone."""
+    path = tmp_path / "mask_rcnn_r101.pth"
+    torch.save(mask_rcnn(Architecture("resnet101")).state_dict(), path)
+    detector = load_light(f"torchvision:{path}", threshold=0.05)
+
+    body = torchvision.models.detection.backbone_utils.resnet_fpn_backbone(backbone_name="resnet101", weights=None)
+    reference = light(torchvision.models.detection.MaskRCNN(body, num_classes=91).eval())
+    reference.load_state_dict(torch.load(path, weights_only=True), strict=True)
+    for network in (detector._network, reference):
+        network.transform.min_size, network.transform.max_size = (160,), 320  # of 800 and 1333: seconds
+    image = picture(1)
+    with torch.inference_mode():
+        [expected] = reference([torch.from_numpy(image).permute(2, 0, 1).float() / 255])
+    [found] = detector._run([image])
+    assert len(expected["scores"]) == 6
+    assert expected["labels"].tolist() == found["labels"].tolist()
+    for name in ("boxes", "scores", "masks"):
+        assert expected[name].shape == found[name].shape
+        np.testing.assert_allclose(found[name].numpy(), expected[name].numpy(), atol=1e-4)
+    assert expected["masks"].max() - expected["masks"].min() > 0.5
+    names = torchvision.models.detection.MaskRCNN_ResNet50_FPN_Weights.COCO_V1.meta["categories"]
+    assert [d.category for d in detector.detect(image, None)] == [names[k] for k in expected["labels"]]
+
+
 def test_old_names_become_new_ones() -> None:
     state = build(Architecture("resnet18"), 3).state_dict()
     assert list(old_names(state)) != [name for name in state if not name.endswith("num_batches_tracked")]
