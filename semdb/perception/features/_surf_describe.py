@@ -9,6 +9,7 @@ Arrays are flat and offsets unsigned where time is spent: slices would count ref
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,7 @@ def gaussian(n: int, sigma: float) -> Any:
     return np.outer(weights, weights).astype(np.float32)
 
 
+@lru_cache(maxsize=1)
 def orientation_weights() -> Any:
     """float32 [169]: weights of the gradients around a keypoint, 0 off the disc."""
     i = np.arange(-RADIUS, RADIUS + 1)
@@ -38,6 +40,7 @@ def orientation_weights() -> Any:
     return np.where(disc, gaussian(ACROSS, 2.5), np.float32(0)).ravel()
 
 
+@lru_cache(maxsize=8)
 def descriptor_weights(sigma: float) -> Any:
     """float32 [400]: weights of the gradients of a descriptor, `sigma` in cells."""
     return gaussian(GRID, sigma).ravel()

@@ -42,10 +42,10 @@ class Level:
         """Samples along a side of the image of so many pixels."""
         return -(-(pixels - 1 + 2 * self.margin) // self.step) + 1
 
-    def window(self, positions: Float32Array, reach: float, samples: int) -> tuple[int, int]:
-        """First and last (not included) of the `samples` along a side that lie within `reach` of the `positions`."""
-        first = int((float(positions.min()) + self.margin - reach) // self.step)
-        last = int((float(positions.max()) + self.margin + reach) // self.step) + 2
+    def window(self, low: float, high: float, reach: float, samples: int) -> tuple[int, int]:
+        """First and last (not included) of the `samples` along a side within `reach` of the pixels `low` to `high`."""
+        first = int((low + self.margin - reach) // self.step)
+        last = int((high + self.margin + reach) // self.step) + 2
         first = min(max(first, 0), samples - 2)
         return first, max(min(last, samples), first + 2)
 

@@ -252,12 +252,12 @@ class SURF:
         flat, pitch = plane.sums.reshape(-1), plane.sums.shape[1]
         weights = descriptor_weights(self.window_sigma)
 
-        def run(key: int, chosen: npt.NDArray[np.intp]) -> None:
+        def run(key: int, chosen: npt.NDArray[np.intp], low: list[float], high: list[float]) -> None:
             level = self._level(key)
             rows, columns = level.samples(plane.height), level.samples(plane.width)
-            reach = 15 * CELL * candidates[chosen, 2].max() + 2 * level.step  # of a window turned by 45 degrees
-            left, right = level.window(candidates[chosen, 0], reach, columns)
-            top, bottom = level.window(candidates[chosen, 1], reach, rows)
+            reach = 15 * CELL * high[2] + 2 * level.step  # of a window turned by 45 degrees
+            left, right = level.window(low[0], high[0], reach, columns)
+            top, bottom = level.window(low[1], high[1], reach, rows)
             across = right - left
             grey = self._scratch.array("grey", ((bottom - top) * across,), np.float32)
             smooth(
@@ -270,7 +270,13 @@ class SURF:
             )  # fmt: skip
 
         keys = np.where(angles >= 0, level_keys(candidates[:, 2]), -1)
-        return [partial(run, int(key), np.flatnonzero(keys == key)) for key in np.unique(keys) if key >= 0]
+        order = np.argsort(keys, kind="stable")
+        starts = np.flatnonzero(np.diff(keys[order], prepend=-2))
+        extents = candidates[order, :3]  # x, y, size: of all levels at once, since calls cost more than their work
+        low = np.minimum.reduceat(extents, starts, axis=0).tolist()
+        high = np.maximum.reduceat(extents, starts, axis=0).tolist()
+        groups = zip(keys[order[starts]].tolist(), np.split(order, starts[1:]), low, high, strict=True)
+        return [partial(run, *group) for group in groups if group[0] >= 0]
 
     def _run(self, tasks: Sequence[Callable[[], Any]]) -> list[Any]:
         if self.threads == 1 or len(tasks) < 2:
@@ -310,7 +316,8 @@ class _Scratch(threading.local):
 
 def _shares(n: int, parts: int) -> list[tuple[int, int]]:
     """0 to n in `parts` ranges of about the same length, at least one, none empty."""
-    bounds = np.linspace(0, n, max(parts, 1) + 1).astype(int).tolist()
+    parts = max(parts, 1)
+    bounds = [n * part // parts for part in range(parts + 1)]
     return [(a, b) for a, b in pairwise(bounds) if a < b]
 
 
