@@ -199,10 +199,10 @@ def decode_color(data: bytes, name: str) -> ImageArray:
     `name` is for messages. Raises FrameError for what is no image, truncated or damaged.
     """
     try:
-        bgr = _decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        rgb = _decode(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
     except _ImageError as error:
         raise FrameError(f"{name}: {error}") from error
-    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+    return np.asarray(rgb, dtype=np.uint8)
 
 
 def decode_16bit(data: bytes, name: str, size: tuple[int, int], what: str = "a depth image") -> npt.NDArray[np.uint16]:
