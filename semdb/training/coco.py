@@ -20,23 +20,29 @@ BACKGROUND = "background"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Instance:
-    """One annotated object: `label` counts in the classes of the data (1 is the first), `box` is x, y, w, h pixels."""
+    """One annotated object: `label` counts in the classes of the data (1 is the first), `box` is x, y, w, h pixels.
+
+    `area` is that of the file, in pixels, None where it has none. A `crowd` is a region of many objects.
+    """
 
     label: int
     box: tuple[float, float, float, float]
     segmentation: Any  # polygons [[x, y, ...], ...] or RLE {"size": [h, w], "counts": list or str}
     annotation_id: int
+    area: float | None = None
+    crowd: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """An image of the data and its objects; crowds are left out."""
+    """An image of the data and its objects. `others`, crowds and what is narrower than a pixel, are not learnt from."""
 
     image_id: int
     path: Path
     width: int
     height: int
     instances: tuple[Instance, ...]
+    others: tuple[Instance, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,26 +99,32 @@ def _parse(content: dict[str, Any], file: Path, images: Path, wanted: Sequence[s
     instances: dict[int, list[Instance]] = {int(image["id"]): [] for image in content["images"]}
     for row in content["annotations"]:
         label = label_of.get(int(row["category_id"]))
-        if label is None or row.get("iscrowd"):
+        if label is None:
             continue
         if int(row["image_id"]) not in instances:
             raise TrainingError(f"{file}: annotation {row['id']} is of image {row['image_id']}, which is not listed")
         x, y, w, h = (float(value) for value in row["bbox"])
-        if w >= 1 and h >= 1:
-            instances[int(row["image_id"])].append(Instance(label, (x, y, w, h), row["segmentation"], int(row["id"])))
+        area, crowd = row.get("area"), bool(row.get("iscrowd"))
+        one = Instance(label, (x, y, w, h), row["segmentation"], int(row["id"]), area and float(area), crowd)
+        instances[int(row["image_id"])].append(one)
     pictures = tuple(
         Picture(
             int(image["id"]),
             images / image["file_name"],
             int(image["width"]),
             int(image["height"]),
-            tuple(instances[int(image["id"])]),
+            tuple(one for one in instances[int(image["id"])] if _is_learnt(one)),
+            tuple(one for one in instances[int(image["id"])] if not _is_learnt(one)),
         )
         for image in content["images"]
     )
     if not pictures:
         raise TrainingError(f"{file} lists no image")
     return CocoData(file, (BACKGROUND, *names), tuple(by_name[name] for name in names), pictures)
+
+
+def _is_learnt(instance: Instance) -> bool:
+    return not instance.crowd and min(instance.box[2:]) >= 1
 
 
 def read_picture(picture: Picture) -> ImageArray:

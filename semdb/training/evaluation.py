@@ -54,8 +54,9 @@ def evaluate_detector(detector: Detector, data: CocoData, progress: Progress | N
     """How well `detector` finds the objects of `data`, by COCO's own rules (pycocotools).
 
     The detector must have been loaded with a score threshold of `LEAST_SCORE`: precision is taken over all scores.
-    Detections of classes that are not in `data` do not count. Raises ModelError when pycocotools is not installed,
-    TrainingError when the detector knows none of the classes, UsageError when it is no network.
+    Detections of classes that are not in `data` do not count, nor do those inside crowds. Raises ModelError when
+    pycocotools is not installed, TrainingError when the detector knows none of the classes, UsageError when it is no
+    network.
     """
     if detector.classes is None:
         raise UsageError(f"{detector.info.name} takes masks that come with a recording: nothing to measure")
@@ -80,7 +81,7 @@ def evaluate_detector(detector: Detector, data: CocoData, progress: Progress | N
         truth.dataset = _dataset(data, rle)
         truth.createIndex()
         scores = {kind: _scores(truth, found, data, kind) for kind in ("bbox", "segm")}
-    objects = sum(len(picture.instances) for picture in data.pictures)
+    objects = sum(not one.crowd for picture in data.pictures for one in (*picture.instances, *picture.others))
     in_order = [data.classes[1 + k] for k in np.argsort(data.category_ids)]  # the evaluator sorts classes by id
     per_class = dict(zip(in_order, scores["bbox"][1], strict=True))
     return DetectorScores(scores["bbox"][0], scores["segm"][0], per_class, len(data.pictures), objects)
@@ -117,7 +118,9 @@ def _result(detection: Detection, picture: Picture, ids: dict[str, int], rle: An
 
 def _dataset(data: CocoData, rle: Any) -> dict[str, Any]:
     annotations = [
-        _annotation(instance, picture, data, rle) for picture in data.pictures for instance in picture.instances
+        _annotation(instance, picture, data, rle)
+        for picture in data.pictures
+        for instance in (*picture.instances, *picture.others)
     ]
     for number, annotation in enumerate(annotations, start=1):
         annotation["id"] = number
@@ -131,11 +134,16 @@ def _dataset(data: CocoData, rle: Any) -> dict[str, Any]:
 
 def _annotation(instance: Instance, picture: Picture, data: CocoData, rle: Any) -> dict[str, Any]:
     mask = mask_of(instance, picture)
+    segmentation = rle.encode(np.asfortranarray(mask.astype(np.uint8)))
+    if isinstance(instance.segmentation, list):  # the evaluator fills other pixels along the edge than OpenCV
+        polygons = [polygon for polygon in instance.segmentation if len(polygon) >= 6]
+        if polygons:
+            segmentation = rle.merge(rle.frPyObjects(polygons, picture.height, picture.width))
     return {
         "image_id": picture.image_id,
         "category_id": data.category_ids[instance.label - 1],
         "bbox": list(instance.box),
-        "area": int(np.count_nonzero(mask)),
-        "iscrowd": 0,
-        "segmentation": rle.encode(np.asfortranarray(mask.astype(np.uint8))),
+        "area": float(rle.area(segmentation)) if instance.area is None else instance.area,
+        "iscrowd": int(instance.crowd),
+        "segmentation": segmentation,
     }

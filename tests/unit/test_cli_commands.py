@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import json
 import os
@@ -19,6 +20,7 @@ from semdb.database import schema
 from semdb.database.store import open_store
 from semdb.recordings import DroppedFrame
 from tests.database_samples import fill, plan
+from tests.unit.onnx_files import write_constant_model
 
 
 @pytest.fixture(autouse=True)
@@ -187,6 +189,24 @@ def test_models_list() -> None:
         ("room", "encoder", "gist"),
         ("room", "features", "surf"),
     ]
+
+
+def test_models_list_says_whose_rows_a_file_made(room: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "cache" / "models"
+    folder.mkdir(parents=True)
+    for name, embedding in (("places.onnx", [[1, 2]]), ("other.onnx", [[2, 1]])):
+        write_constant_model(folder / name, {"embedding": np.array(embedding, np.float32)}, {"licence": "MIT"})
+    for map_name in ("kitchen", "hall"):
+        run("ingest", str(room), "--keyframes", "3", "--map", map_name, "--encoder", "onnx:places.onnx")
+    listed = json.loads(run("models", "list", "--json").stdout)
+    files = {file["file"]: file for file in listed["files"]}
+    sha256 = hashlib.sha256((folder / "places.onnx").read_bytes()).hexdigest()
+    assert (files["places.onnx"]["sha256"], files["places.onnx"]["licence"]) == (sha256, "MIT")
+    assert files["places.onnx"]["maps"] == ["hall", "kitchen"]
+    assert files["other.onnx"]["maps"] == []
+    assert {m["sha256"] for m in listed["maps"] if m["role"] == "encoder"} == {sha256}
+    [line] = [line for line in run("models", "list").stdout.splitlines() if line.startswith("places.onnx")]
+    assert line.split() == ["places.onnx", "onnx:places.onnx", "yes", sha256[:12], "MIT", "hall,", "kitchen"]
 
 
 def test_every_listed_spec_is_known_to_its_loader() -> None:

@@ -13,7 +13,9 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from typer.testing import CliRunner
 
+from semdb.cli.main import app
 from semdb.errors import ModelError, TrainingError, UsageError
 from semdb.perception.detectors import load_detector
 from semdb.recordings.synthetic.coco import run_lengths
@@ -101,7 +103,7 @@ def test_a_run_that_was_cut_off_ends_as_if_it_had_not_been(shapes: Path, tmp_pat
     options = tiny(shapes, tmp_path / "whole", epochs=(1, 0, 1), rates=(1e-3, 1e-3, 1e-3))
     whole = train(options, SETTINGS)
     part = replace(options, output=tmp_path / "part")
-    for stop in (2, 4):  # in the middle of the first stage, and of the second
+    for stop in (2, 3, 4):  # in the middle of the first stage, at its end, in the middle of the second
         torch.manual_seed(stop)  # a new process begins with other random numbers
         train(part, SETTINGS, resume=stop > 2, stop_after=stop)
     done = train(part, SETTINGS, resume=True)
@@ -276,6 +278,73 @@ def test_scores_of_detectors_that_are_known(shapes: Path) -> None:
     assert turned.class_ap50 == pytest.approx({"disc": 0, "square": 1})
     nothing = evaluate_detector(Perfect(shapes, drop="disc"), load_coco(shapes, "train", ["disc"]))
     assert nothing.boxes.values == nothing.masks.values == (0, 0, 0, 0)
+
+
+def test_scores_are_those_of_the_evaluator_on_the_file(shapes: Path, tmp_path: Path) -> None:
+    """Crowds, polygons, and objects narrower than a pixel: as the evaluator takes them when it reads the file."""
+    from pycocotools import mask as rle
+    from pycocotools.coco import COCO
+    from pycocotools.cocoeval import COCOeval
+
+    content = json.loads((shapes / "annotations" / "instances_train.json").read_text())
+    rows = content["annotations"]
+    for crowd in (rows[0], rows[4]):
+        crowd |= {"iscrowd": 1, "segmentation": {"size": [48, 64], "counts": [0, 48 * 64]}, "bbox": [0, 0, 64, 48]}
+    rows[3]["segmentation"] = [[38.3, 16.2, 54.1, 16.2, 54.1, 31.7, 38.3, 31.7]]
+    rows[5] |= {"bbox": [40, 10, 0.5, 12], "segmentation": [[40, 10, 40.5, 10, 40.5, 22]], "area": 3}
+    (tmp_path / "annotations").mkdir()
+    (tmp_path / "train").symlink_to(shapes / "train")
+    file = tmp_path / "annotations" / "instances_train.json"
+    file.write_text(json.dumps(content))
+    data = load_coco(tmp_path, "train")
+    assert sum(len(picture.instances) for picture in data.pictures) == 21
+    found = evaluate_detector(Perfect(shapes, shift=2), data)
+    assert found.objects == 22
+
+    truth, seen, results = COCO(str(file)), Perfect(shapes, shift=2), []
+    for picture in data.pictures:
+        for d in seen.detect(read_picture(picture), None):
+            x0, y0, x1, y1 = map(float, d.box)
+            row = {"image_id": picture.image_id, "category_id": 1 + CLASSES.index(d.category), "score": d.score}
+            mask = rle.encode(np.asfortranarray(d.mask.astype(np.uint8)))
+            results.append({**row, "bbox": [x0, y0, x1 - x0, y1 - y0], "segmentation": mask})
+    for kind, scores in (("bbox", found.boxes), ("segm", found.masks)):
+        reference = COCOeval(truth, truth.loadRes([dict(row) for row in results]), kind)
+        reference.evaluate()
+        reference.accumulate()
+        reference.summarize()
+        assert scores.values == pytest.approx(reference.stats[[0, 1, 2, 8]], abs=1e-12)
+        assert 0.3 < scores.ap < 1
+
+
+def test_commands_train_go_on_and_print_table_2(shapes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SEMDB_THREADS", "1")
+    data, output = ("--coco", str(shapes), "--classes", "disc,square"), str(tmp_path / "out")
+    recipe = ("--weights", "none", "--backbone", "resnet18", "--min-size", "48", "--max-size", "64", "--anchor", "8")
+    small = ("--channels", "16", "--batch", "6", "--rois", "16", "--device", "cpu", "--epochs", "1,1,1")
+    command = ["train", "detector", *data, "--output", output, *recipe, *small]
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == 0, done.output
+    assert done.stdout.startswith("6 steps, loss ")
+    rows = list(csv.DictReader((tmp_path / "out" / "curves.csv").open()))
+    assert [row["stage"] for row in rows] == ["heads"] * 2 + ["fpn and heads"] * 2 + ["all layers"] * 2
+    assert CliRunner().invoke(app, command).exit_code == 2
+    assert CliRunner().invoke(app, [*command, "--resume"]).stdout.startswith("6 steps")
+    spec, scores = f"torchvision:{output}/{CHECKPOINT}", tmp_path / "scores.json"
+    done = CliRunner().invoke(app, ["evaluate-detector", spec, *data, "--split", "train", "--json", str(scores)])
+    assert done.exit_code == 0, done.output
+    lines = [line.split() for line in done.stdout.splitlines()]
+    assert lines[1] == ["AP", "AP50", "AP75", "AR"]
+    table = {
+        " ".join(line[:-4]): line[-4:]
+        for line in lines[2:]
+        if line and line[0] in ("boxes", "boxes,", "masks", "masks,")
+    }
+    assert table["boxes, paper on COCO minival"] == ["0.354", "0.546", "0.385", "0.437"]
+    assert table["masks, paper on COCO minival"] == ["0.305", "0.513", "0.318", "0.384"]
+    kept = json.loads(scores.read_text())
+    for kind in ("boxes", "masks"):
+        assert table[kind] == [f"{kept[kind][name]:.3f}" for name in ("ap", "ap50", "ap75", "ar")]
 
 
 def test_masks_of_a_recording_are_not_measured(shapes: Path) -> None:
