@@ -275,7 +275,7 @@ def assert_equal_within_rounding(one: Store, other: Store) -> None:
     for a, b in zip(*keyframes, strict=True):
         assert len(a.objects) == len(b.objects) > 0
         np.testing.assert_allclose([o.score for o in a.objects], [o.score for o in b.objects], atol=1e-4)
-        np.testing.assert_allclose([o.box for o in a.objects], [o.box for o in b.objects], atol=1e-2)
+        np.testing.assert_allclose([o.box for o in a.objects], [o.box for o in b.objects], rtol=0, atol=1e-3)
         np.testing.assert_array_equal(a.keypoints.features.descriptors, b.keypoints.features.descriptors)
     vectors = [store.load_vectors([k.id for k in found]) for store, found in zip((one, other), keyframes, strict=True)]
     np.testing.assert_allclose(vectors[0], vectors[1], atol=1e-4)
