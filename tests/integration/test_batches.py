@@ -159,9 +159,15 @@ def test_a_frame_that_the_networks_fail_on_fails_alone(room: Path, store: Store,
     assert content(store)["frames"] == [row for row in expected["frames"] if row[0] != frame]
 
 
-def test_a_batch_that_is_too_much_is_done_one_by_one(room: Path, store: Store, expected: Any) -> None:
+def test_a_batch_that_is_too_much_is_done_one_by_one(
+    room: Path, store: Store, expected: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    events: list[tuple[str, dict[str, Any]]] = []
+    monkeypatch.setattr("semdb.item_work.event", lambda name, **fields: events.append((name, fields)))
     seen = Bright(lambda images: len(images) > 2)
     assert ingest(room, store, describer(3, seen)).stored == 8
+    said = [fields for name, fields in events if name == "one_by_one"]
+    assert said == [{"frames": 3, "error": "bright: does not see"}] * 2
     assert seen.given == [3, 1, 1, 1, 3, 1, 1, 1, 2]
     assert content(store) == expected
 
