@@ -25,36 +25,39 @@ from semdb.types import Camera, Float32Array
 # depth up to 5 m, a floor seen at 10 degrees changes by 1 % a pixel.
 MAX_STEP = 0.03
 TOLERANCE = np.float32(-1e-4)  # a pixel centre on the edge of two triangles belongs to one of them at least
+BAND = 64  # rows at a time: what is computed of them stays in the processor's cache
 NONE, SEVERAL = np.int32(-1), np.int32(-2)  # how many pixels a triangle may see, where it is not one
 
 
 def register_seven_scenes(depth: Float32Array, camera: Camera) -> Float32Array:
     """Depth ``[480, 640]`` metres of the depth camera (NaN invalid) as seen by the colour `camera` ``[H, W]``."""
-    u, v, inverse_z, known = (np.empty(depth.shape, dtype=np.float32) for _ in range(4))
-    shift = COLOR_FROM_DEPTH[:3, 3].astype(np.float32)
+    shift, rays = COLOR_FROM_DEPTH[:3, 3].astype(np.float32), _rotated_rays()
     distorted = any(camera.distortion)
     lens = (1.0, 1.0, 0.0, 0.0) if distorted else (camera.fx, camera.fy, camera.cx, camera.cy)
     fx, fy, cx, cy = (np.float32(number) for number in lens)
     depth = np.ascontiguousarray(depth, dtype=np.float32)
-    _transform(depth, _rotated_rays(), shift, fx, fy, cx, cy, u, v, inverse_z, known)
-    if distorted:
-        pixels = normalized_to_pixels(camera, np.column_stack([u.ravel(), v.ravel()]).astype(np.float64))
-        u = pixels[:, 0].reshape(depth.shape).astype(np.float32)
-        v = pixels[:, 1].reshape(depth.shape).astype(np.float32)
     nearest = np.zeros((camera.height, camera.width), dtype=np.float32)  # 1/z, 0 is nothing
-    _rasterise(known, u, v, inverse_z, np.float32(MAX_STEP), nearest)
+    for top in range(0, len(depth) - 1, BAND):
+        part = depth[top : top + BAND + 1]
+        u, v, inverse_z, known = np.empty((4, *part.shape), dtype=np.float32)
+        _transform(part, rays[top : top + BAND + 1], shift, fx, fy, cx, cy, u, v, inverse_z, known)
+        if distorted:
+            pixels = normalized_to_pixels(camera, np.column_stack([u.ravel(), v.ravel()]).astype(np.float64))
+            u = pixels[:, 0].reshape(part.shape).astype(np.float32)
+            v = pixels[:, 1].reshape(part.shape).astype(np.float32)
+        _rasterise(known, u, v, inverse_z, np.float32(MAX_STEP), nearest)
     _invert(nearest)
     return nearest
 
 
 @lru_cache(maxsize=1)
-def _rotated_rays() -> Float32Array:  # [3, 480, 640]
+def _rotated_rays() -> Float32Array:  # [480, 3, 640]
     """Directions of the depth camera's pixels at z = 1, turned into the colour camera."""
     camera = SEVEN_SCENES_DEPTH
     v, u = np.mgrid[: camera.height, : camera.width]
     rays = back_project(camera, np.column_stack([u.ravel(), v.ravel()]), np.ones(u.size))
-    turned = (rays @ COLOR_FROM_DEPTH[:3, :3].T).T.reshape(3, camera.height, camera.width)
-    return np.ascontiguousarray(turned, dtype=np.float32)
+    turned = (rays @ COLOR_FROM_DEPTH[:3, :3].T).reshape(camera.height, camera.width, 3)
+    return np.ascontiguousarray(turned.transpose(0, 2, 1), dtype=np.float32)
 
 
 @kernel
@@ -65,9 +68,9 @@ def _transform(  # type: ignore[no-untyped-def]  # pragma: no cover
     for row in range(depth.shape[0]):
         for column in range(depth.shape[1]):
             d = depth[row, column]
-            w = np.float32(1) / (d * rays[2, row, column] + shift[2])
-            x = (d * rays[0, row, column] + shift[0]) * w
-            y = (d * rays[1, row, column] + shift[1]) * w
+            w = np.float32(1) / (d * rays[row, 2, column] + shift[2])
+            x = (d * rays[row, 0, column] + shift[0]) * w
+            y = (d * rays[row, 1, column] + shift[1]) * w
             u[row, column] = x * fx + cx
             v[row, column] = y * fy + cy
             inverse_z[row, column] = w
