@@ -192,17 +192,16 @@ def smooth(sums: Any, pitch: int, pad: int, step: int, half: int, edge: float, m
             x = np.uintp(i)
             inner[x] = np.int32(sums[b + x] - sums[a + x])
             wide[x] = np.int32(sums[d + x] - sums[c + x])
+        if step == 1:
+            line = out[k * columns : (k + 1) * columns]
         for i in range(n):
             x = np.uintp(i)
             box = np.float32(np.int32(inner[i1 + x] - inner[i0 + x])) * w00
             rim = np.int32(np.int32(inner[r1 + x] - inner[x]) + np.int32(wide[i1 + x] - wide[i0 + x]))
             corner = np.float32(np.int32(wide[r1 + x] - wide[x])) * w11
             line[x] = box + np.float32(rim) * w01 + corner
-        target = np.uintp(k * columns)
-        if step == 1:
-            for i in range(columns):
-                out[target + np.uintp(i)] = line[i]
-        else:
+        if step > 1:
+            target = np.uintp(k * columns)
             for i in range(columns):
                 out[target + np.uintp(i)] = line[i * step]
 

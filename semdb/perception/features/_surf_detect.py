@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from semdb.compiled import kernel
 
@@ -38,15 +39,29 @@ def integral(image: Any, out: Any) -> None:
             below[x + 1] = np.int32(above[x + 1] + row)
 
 
+def offsets_read(octave: int, layers: int) -> npt.NDArray[np.bool_]:
+    """Which remainders, of the division by the octave's step, the corners of its boxes have (`_filter_boxes`)."""
+    read = np.zeros(1 << octave, np.bool_)
+    for layer in range(layers + 2):
+        size = (9 + 6 * layer) << octave
+        corners = [0, size // 3, 2 * (size // 3), size, *((k * size + 9) // 18 for k in (2, 4, 8, 10, 14, 16))]
+        read[np.array(corners) % len(read)] = True
+    return read
+
+
 @kernel
-def deinterleave(sums: Any, first: int, last: int, out: Any) -> None:
+def deinterleave(sums: Any, first: int, last: int, read: Any, out: Any) -> None:
     """`out` [rows, step, columns]: every `step`-th column of `sums` [rows, W] side by side, for contiguous reads;
-    rows `first` to `last` only.
+    rows `first` to `last` only, and of rows and columns those that are `read` [step], by their remainder.
     """
     _, step, columns = out.shape
     for y in range(first, last):
+        if not read[y % step]:
+            continue
         source = sums[y]
         for phase in range(step):
+            if not read[phase]:
+                continue
             target = out[y, phase]
             for x in range(columns):
                 target[x] = source[x * step + phase]

@@ -181,7 +181,7 @@ class SURF:
         return plane, candidates, order
 
     def _octave_tasks(self, plane: _Plane, octave: int, region: BoolArray | None) -> list[Callable[[], Float32Array]]:
-        from semdb.perception.features._surf_detect import COLUMNS, deinterleave, find_maxima
+        from semdb.perception.features._surf_detect import COLUMNS, deinterleave, find_maxima, offsets_read
 
         step = 1 << octave
         rows, columns = plane.height // step, plane.width // step
@@ -189,7 +189,8 @@ class SURF:
         if step > 1:
             across = (plane.pad + plane.width) // step + 1
             phases = self._scratch.array(f"octave {octave}", (plane.sums.shape[0], step, across), np.int32)
-            deinterleave(plane.sums, plane.pad, plane.pad + plane.height + 1, phases)
+            read = offsets_read(octave, self.n_octave_layers)
+            deinterleave(plane.sums, plane.pad, plane.pad + plane.height + 1, read, phases)
 
         def search(first: int, last: int, spans: npt.NDArray[np.int64]) -> Float32Array:
             capacity = 64 + (last - first) * columns // 64
