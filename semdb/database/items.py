@@ -15,7 +15,7 @@ import socket
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sqlalchemy import ColumnElement, Connection, Engine, and_, func, or_, select, update
+from sqlalchemy import BindParameter, ColumnElement, Connection, Engine, and_, func, or_, select, update
 
 from semdb.database import retry
 from semdb.database.clock import now_plus
@@ -26,6 +26,7 @@ LEASE_S = 60
 MOST_ATTEMPTS = 10  # claims without an outcome after which a keyframe is taken to kill its workers
 _item = ingest_items.c
 _NOT_HELD = {"worker": None, "lease_until": None}
+_Number = int | BindParameter[int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,13 +97,13 @@ def _give_up(connection: Connection, which: ColumnElement[bool]) -> None:
     connection.execute(update(ingest_items).where(which).values(state=ItemState.FAILED.value, error=error, **_NOT_HELD))
 
 
-def held_by(recording_id: int, claimed: Claim) -> ColumnElement[bool]:
+def held_by(recording_id: _Number, frame_index: _Number, token: _Number) -> ColumnElement[bool]:
     """The condition that a claim still holds."""
     return and_(
         _item.recording_id == recording_id,
-        _item.frame_index == claimed.frame_index,
+        _item.frame_index == frame_index,
         _item.state == ItemState.RUNNING.value,
-        _item.attempts == claimed.token,
+        _item.attempts == token,
     )
 
 
@@ -143,7 +144,7 @@ def release_dead(engine: Engine, recording_id: int | None = None) -> int:
 def fail(engine: Engine, recording_id: int, claimed: Claim, error: str) -> bool:
     """Notes why a claimed keyframe cannot be described. False where the claim holds no longer: then nothing changes."""
     values = {"state": ItemState.FAILED.value, "error": error[:4000], **_NOT_HELD}
-    change = update(ingest_items).where(held_by(recording_id, claimed)).values(**values)
+    change = update(ingest_items).where(held_by(recording_id, claimed.frame_index, claimed.token)).values(**values)
     return retry.write(engine, lambda c: c.execute(change).rowcount == 1)
 
 

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any, NoReturn
 
 import numpy as np
-from sqlalchemy import Connection, Engine, Table, insert, select, update
+from sqlalchemy import Connection, Engine, Table, bindparam, insert, select, update
 from sqlalchemy.exc import IntegrityError
 
 from semdb.class_score import strengths
@@ -24,6 +24,18 @@ from semdb.geometry import quat_wxyz_from_rotation
 from semdb.types import Description, FloatArray, ModelInfo
 
 _STATEMENT_OVERHEAD = 4096  # bytes of a statement beside its blobs
+_item = tables.ingest_items.c
+# Statements of each keyframe with conditions are built once: that takes as long as to run them.
+_MARK_DONE = update(tables.ingest_items).values(state=ItemState.DONE.value, error=None, worker=None, lease_until=None)
+_TAKE_CLAIMED = _MARK_DONE.where(held_by(bindparam("of_recording"), bindparam("of_frame"), bindparam("of_token")))
+_TAKE = _MARK_DONE.values(attempts=_item.attempts + 1).where(
+    _item.recording_id == bindparam("of_recording"),
+    _item.frame_index == bindparam("of_frame"),
+    _item.state.not_in((ItemState.DONE.value, ItemState.DELETED.value)),
+)
+_OBJECT_IDS = select(tables.objects.c.ordinal, tables.objects.c.id).where(
+    tables.objects.c.keyframe_id == bindparam("of_keyframe")
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,17 +272,10 @@ def _write(
 
 def _take(connection: Connection, recording_id: int, frame_index: int, claimed: Claim | None) -> bool:
     """Marks an item done. False when there is none to be done: stored already, of another claim, or not planned."""
-    items = tables.ingest_items.c
-    values: dict[str, Any] = {"state": ItemState.DONE.value, "error": None, "worker": None, "lease_until": None}
-    change = update(tables.ingest_items)
-    if claimed is not None:
-        change = change.where(held_by(recording_id, claimed))
-    else:
-        done = (ItemState.DONE.value, ItemState.DELETED.value)
-        change = change.where(items.recording_id == recording_id, items.frame_index == frame_index)
-        change = change.where(items.state.not_in(done))
-        values["attempts"] = items.attempts + 1
-    return connection.execute(change.values(**values)).rowcount == 1
+    place = {"of_recording": recording_id, "of_frame": frame_index}
+    if claimed is None:
+        return connection.execute(_TAKE, place).rowcount == 1
+    return connection.execute(_TAKE_CLAIMED, {**place, "of_token": claimed.token}).rowcount == 1
 
 
 def _refuse(connection: Connection, recording_id: int, frame_index: int) -> NoReturn:
@@ -307,8 +312,7 @@ def _write_children(connection: Connection, keyframe_id: int, rows: _Rows) -> No
     for row in rows.objects:
         _check_size(connection, tables.objects, row, rows.keyframe["frame_index"], 2)  # written in hexadecimal
     connection.execute(insert(tables.objects), [{**key, **row} for row in rows.objects])
-    query = select(tables.objects.c.ordinal, tables.objects.c.id).where(tables.objects.c.keyframe_id == keyframe_id)
-    object_ids = {row.ordinal: row.id for row in connection.execute(query)}
+    object_ids = {row.ordinal: row.id for row in connection.execute(_OBJECT_IDS, {"of_keyframe": keyframe_id})}
     slices = [{**row, "object_id": object_ids[ordinal]} for ordinal, row in enumerate(rows.slices)]
     connection.execute(insert(tables.object_features), slices)
 
