@@ -24,7 +24,7 @@ QUERY = 0  # index of the query among the images
 PARAMETERS_OF_QUERY = 9
 # Of the covariance (see `_covariance`), fitted on half of the rendered rooms with keyframes near and far
 CELL = 0.152  # over the focal length: 80 pixels of 525; within it errors are alike
-SHARED_FACTOR = 1.1  # by which errors that cells have in common exceed what single cells show; and
+SHARED_FACTOR = 1.3  # by which errors that cells have in common exceed what single cells show; and
 SHARED_PER_RAD = 19.0  # so much more per radian between the rays from which query and keyframe see a point
 SHARED_VARIANCE = 0.025  # of the assumed variance, believed whatever the residuals
 MOST_CORRECTION = 4.0  # of the scatter of few cells

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from semdb.geometry import invert_pose, project, transform_points
-from semdb.localization.likeness import likeness_share
+from semdb.localization.likeness import likeness_about
 from semdb.localization.pose import PoseEstimate
 from semdb.localization.views import KeyframeView, View
 from semdb.types import BoolArray, Float32Array, FloatArray, IntArray
@@ -40,8 +40,8 @@ FEATURES = (
     "sharp but unlike",
 )
 # Of the logistic model; fitted by ``python -m bench.trust --fit fit``. None is negative.
-WEIGHTS = (0.000, 0.000, 8.331, 0.000, 0.000, 0.885, 0.675, 0.000, 0.000, 0.000, 1.859, 0.305, 3.551)
-INTERCEPT = -1.239
+WEIGHTS = (0.000, 0.000, 5.905, 0.000, 0.000, 0.438, 3.419, 0.000, 0.000, 0.000, 2.773, 0.268, 7.885)
+INTERCEPT = -1.324
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class Evidence:
     explained: float  # of the keyframes' points that should be seen, those that are inliers
     query_share: float  # of the query's keypoints, those that are inliers
     aligned: float  # of the inlier pairs, those whose patches are alike to the pixel
-    likeness: float  # of the best keyframe's points about inliers, those whose patches look alike in the query
+    likeness: float  # of the best keyframe's image about its inliers, the share that looks alike in the query
     confirmed: float  # of the keyframes' points that fall on a keypoint of the query, those that look like it
     coverage: float  # of the cells in which keyframes' points should be seen (at least four), those that hold inliers
     classes: float  # of the objects' points that should be seen, those that lie on an object of their class
@@ -99,7 +99,9 @@ def gather_evidence(
     order = np.argsort(-pairs, kind="stable")
     supporters = [int(n) for n in order if pairs[n] >= SUPPORTER_PAIRS] or [int(order[0])]
     explained, confirmed, coverage, classes, class_points = _what_should_be_seen(query, keyframes, estimate, supporters)
-    likeness = _likeness(query, keyframes[supporters[0]], estimate)
+    best_slot = supporters[0]
+    own = estimate.pairs.take(estimate.pairs.slot == best_slot)
+    likeness = likeness_about(query, keyframes[best_slot], estimate.world_from_camera, own.query, own.keypoint)
     known = np.asarray(cosines, float)
     best = known[supporters]
     others = np.delete(known, supporters)
@@ -169,16 +171,6 @@ def _what_should_be_seen(
     return explained, confirmed, coverage, classes, compared
 
 
-def _likeness(query: View, keyframe: KeyframeView, estimate: PoseEstimate) -> float | None:
-    """`Evidence.likeness`: among the points that fall into cells of the image that hold inliers."""
-    rows, pixels = _seen_points(query, keyframe, estimate)
-    size = np.array([query.camera.width, query.camera.height], float)
-    held = _cells_of(query.seen_xy[estimate.pairs.query], size)
-    cells = (pixels * GRID / size).astype(int)
-    about = held[cells[:, 1] * GRID + cells[:, 0]]
-    return likeness_share(query, keyframe, estimate.world_from_camera, rows[about], pixels[about])
-
-
 def _seen_points(query: View, keyframe: KeyframeView, estimate: PoseEstimate) -> tuple[IntArray, FloatArray]:
     """Which of the keyframe's points the pose puts into the query's image, and where ``[n, 2]``, pixels as seen."""
     local = transform_points(invert_pose(estimate.world_from_camera), keyframe.world_points)
@@ -200,7 +192,7 @@ def _cells_of(pixels: Float32Array, size: FloatArray) -> BoolArray:
 def confidence_features(evidence: Evidence) -> FloatArray:
     """What the confidence is made of ``[13]``, in the order of `FEATURES`; each grows with what speaks for the pose."""
     rival = evidence.rival / max(evidence.first_of_best, 1)
-    # patches that do not look alike say little of a blurred image and much of a sharp one
+    # what does not look alike says little of a blurred image and much of a sharp one
     sharp_but_unlike = min(evidence.aligned / SHARP, 1.0) * (1 - evidence.likeness)
     return np.array(
         [

@@ -35,7 +35,7 @@ class VerdictOptions:
     minimum_spread: float = 0.19  # three cells of a 4x4 grid over the image
     maximum_translation_sigma_m: float = 0.06
     maximum_rotation_sigma_deg: float = 1.5
-    localized_confidence: float = 0.85
+    localized_confidence: float = 0.82
     rival_share: float = 0.7  # of the first inliers with the best keyframe, that a pose elsewhere may have at most
 
 

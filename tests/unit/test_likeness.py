@@ -1,4 +1,4 @@
-"""Patches of a keyframe, compared where a pose puts them in the query."""
+"""What a keyframe shows about its inliers, compared where a pose puts it in the query."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from semdb.geometry import pixels_to_normalized
-from semdb.localization.likeness import likeness_share
+from semdb.localization.likeness import likeness_about
 from semdb.localization.views import KeyframeView, View
 from semdb.types import Camera, ImageArray
 
@@ -46,16 +46,24 @@ def view(grey: ImageArray | None) -> View:
     )
 
 
-def share(query: ImageArray | None, keyframe: ImageArray | None, shift_px: float = 0.0) -> float | None:
-    """Of the wall as `keyframe` shows it in `query`, seen from where it stands `shift_px` further left."""
+def share(
+    query: ImageArray | None,
+    keyframe: ImageArray | None,
+    shift_px: float = 0.0,
+    seen_shift_px: float | None = None,
+    inliers: slice = slice(None),
+) -> float | None:
+    """Of the wall as `keyframe` shows it in `query`, said to be seen from `shift_px` further left.
+
+    The inliers are seen there, or `seen_shift_px` further.
+    """
     own = view(keyframe)
     pose = np.eye(4)
     pose[0, 3] = shift_px * DEPTH_M / CAMERA.fx
     known = KeyframeView(1, own, np.eye(4), np.eye(4), own.points.astype(float))
-    moved = own.points - pose[:3, 3]
-    pixels = moved[:, :2] / moved[:, 2:] * 260.0 + [CAMERA.cx, CAMERA.cy]
-    rows = np.arange(len(own), dtype=np.int32)
-    return likeness_share(replace(own, grey=query), known, pose, rows, pixels.astype(float))
+    moved = own.seen_xy - np.array([shift_px if seen_shift_px is None else seen_shift_px, 0], np.float32)
+    chosen = np.arange(len(own), dtype=np.int32)[inliers]
+    return likeness_about(replace(own, grey=query, seen_xy=moved), known, pose, chosen, chosen)
 
 
 def test_the_same_wall_looks_alike() -> None:
@@ -65,10 +73,18 @@ def test_the_same_wall_looks_alike() -> None:
 def test_a_wall_seen_from_beside_is_found_where_the_pose_puts_it() -> None:
     beside = np.roll(wall(), -12, axis=1)
     assert share(beside, wall(), 12.0) == pytest.approx(1.0, abs=0.02)
-    assert share(beside, wall(), 14.0) == pytest.approx(1.0, abs=0.02)  # the pose may be two pixels off
+    assert share(beside, wall(), 13.0, 13.0) == pytest.approx(1.0, abs=0.02)  # the pose may be a little off
     found = share(beside, wall(), 0.0)
     assert found is not None
     assert found < 0.05
+
+
+def test_what_poses_are_off_by_is_read_off_the_inliers() -> None:
+    """Recorded poses of the red kitchen disagree by several pixels; the pairs say where things are."""
+    beside = np.roll(wall(), -12, axis=1)
+    found = share(beside, wall(), 8.0, 12.0)
+    assert found is not None
+    assert found > 0.95
 
 
 def test_the_mirrored_wall_is_another() -> None:
@@ -78,20 +94,57 @@ def test_the_mirrored_wall_is_another() -> None:
 
 
 def test_darker_and_flatter_is_no_difference() -> None:
-    assert share((wall() * 0.3 + 20).astype(np.uint8), wall()) == 1.0
+    assert share((wall() * 0.3 + 20).astype(np.uint8), wall()) == pytest.approx(1.0, abs=0.01)
 
 
-@pytest.mark.parametrize("sigma", [2.0, 4.0])
+def test_what_lies_far_from_every_inlier_says_nothing() -> None:
+    """The right half of the wall is another one; the inliers are on the left."""
+    changed = wall()
+    changed[:, 160:] = wall(seed=1)[:, 160:]
+    columns = np.arange(GRID[0].size).reshape(GRID[0].shape)[:, :4]
+    chosen = np.zeros(GRID[0].size, np.bool_)
+    chosen[columns.ravel()] = True
+    own = view(wall())
+    known = KeyframeView(1, own, np.eye(4), np.eye(4), own.points.astype(float))
+    rows = np.flatnonzero(chosen).astype(np.int32)
+    assert likeness_about(replace(own, grey=changed), known, np.eye(4), rows, rows) == pytest.approx(1.0, abs=0.01)
+    every = np.arange(len(own), dtype=np.int32)
+    half = likeness_about(replace(own, grey=changed), known, np.eye(4), every, every)
+    assert half is not None
+    assert 0.4 < half < 0.65
+
+
+def test_a_slanted_wall_is_seen_as_it_is() -> None:
+    """A floor that falls away from the camera: depth is known at keypoints, and what lies between them follows."""
+    own, pose = view(wall()), np.eye(4)
+    pose[0, 3] = 0.1
+    depth = 1.5 + 2.0 * own.seen_xy[:, 1] / CAMERA.height
+    points = np.column_stack([own.xy, np.ones(len(own))]) * depth[:, None]
+    row, column = np.mgrid[: CAMERA.height, : CAMERA.width].astype(np.float32)
+    # the query shows at (x, y) what the keyframe shows at x + fx * 0.1 / depth
+    beside = cv2.remap(wall(), column + np.float32(26.0) / (1.5 + 2.0 * row / CAMERA.height), row, cv2.INTER_LINEAR)
+    seen = own.seen_xy - np.column_stack([26.0 / depth, np.zeros(len(own))]).astype(np.float32)
+    slanted = replace(own, points=points.astype(np.float32))
+    rows = np.arange(len(own), dtype=np.int32)
+    query, known = replace(own, grey=beside, seen_xy=seen), KeyframeView(1, slanted, np.eye(4), np.eye(4), points)
+    found = likeness_about(query, known, pose, rows, rows)
+    assert found is not None
+    assert found > 0.9
+
+
+@pytest.mark.parametrize(("sigma", "least"), [(1.0, 0.9), (1.5, 0.6)])
 @pytest.mark.parametrize("query_is_blurred", [True, False])
-def test_a_blurred_image_of_the_wall_looks_alike(sigma: float, query_is_blurred: bool) -> None:
+def test_a_blurred_image_of_the_wall_looks_more_alike_than_another_wall(
+    sigma: float, least: float, *, query_is_blurred: bool
+) -> None:
     blurred = cv2.GaussianBlur(wall(), (0, 0), sigma).astype(np.uint8)
     pair = (blurred, wall()) if query_is_blurred else (wall(), blurred)
     found = share(*pair)
     assert found is not None
-    assert found > 0.9
+    assert found > least
     other = share(blurred, wall(seed=1))
     assert other is not None
-    assert other < 0.1
+    assert other < 0.05
 
 
 def test_nothing_is_said_where_nothing_can_be_compared() -> None:
@@ -99,3 +152,5 @@ def test_nothing_is_said_where_nothing_can_be_compared() -> None:
     assert share(wall(), None) is None
     flat = np.full((240, 320), 90, np.uint8)
     assert share(wall(), flat) is None
+    assert share(wall(), wall(), inliers=slice(0, 0)) is None
+    assert share(wall(), wall(), 1000.0) is None  # the pose puts all of it beside the image
