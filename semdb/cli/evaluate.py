@@ -124,6 +124,8 @@ class Outputs:
     def add(self, outcome: Outcome) -> None:
         if outcome.error is not None:
             self.failed.append(outcome)
+            if self.several:  # the others may take hours
+                self._say_failed(outcome)
             return
         self.results += outcome.results
         self._write()
@@ -142,11 +144,11 @@ class Outputs:
             write_report(self.report, self.results, settings=self.settings, failures=failures)
 
     def finish(self, ablation: bool) -> None:
-        """The tables on the terminal. Raises the error where nothing succeeded, exits with 1 where something failed."""
+        """The tables on the terminal. Exits with 1 where something failed, with the error's code where all did."""
         from semdb.cli.progress import say
 
         if not self.results:
-            raise first_error(self.failed)
+            raise self._all_failed()
         show(self.results, ablation)
         if self.failed:
             self._write()  # the page names what failed after the last success, too
@@ -155,23 +157,34 @@ class Outputs:
         if self.trajectories is not None:
             say(f"wrote trajectories to {self.trajectories}; evo_ape tum NAME-truth.txt NAME.txt reads them")
         for outcome in self.failed:
-            say(f"not evaluated: {without_name(outcome)}")
+            self._say_failed(outcome)
         if self.failed:
             raise typer.Exit(1)
+
+    def _say_failed(self, outcome: Outcome) -> None:
+        from semdb.cli.progress import say
+
+        say(f"not evaluated: {without_name(outcome)}")
+
+    def _all_failed(self) -> Exception:
+        """The error itself where it is the only one; else the exit code of the first, once all have been said."""
+        from semdb.errors import UsageError
+
+        errors = [outcome.error for outcome in self.failed if outcome.error is not None]
+        if not errors:
+            return UsageError("nothing was evaluated")
+        if len(errors) == 1 and not self.several:
+            return errors[0]
+        if not self.several:
+            for outcome in self.failed:
+                self._say_failed(outcome)
+        return typer.Exit(errors[0].exit_code)
 
 
 def without_name(outcome: Outcome) -> str:
     """What failed and why, where the reason does not begin with its name anyway."""
     reason = str(outcome.error)
     return reason if reason.startswith(outcome.name) else f"{outcome.name}: {reason}"
-
-
-def first_error(failed: list[Outcome]) -> Exception:
-    """The error to end with where nothing succeeded."""
-    from semdb.errors import UsageError
-
-    errors = [outcome.error for outcome in failed if outcome.error is not None]
-    return errors[0] if errors else UsageError("nothing was evaluated")
 
 
 def expects_several(paths: list[Path] | None, options: EvaluateOptions) -> bool:
@@ -185,6 +198,7 @@ def expects_several(paths: list[Path] | None, options: EvaluateOptions) -> bool:
 def check_outputs(json_file: Path | None, report: Path | None, trajectories: Path | None = None) -> None:
     """Raises UsageError where the results could not be written in the end, before anything is computed."""
     import os
+    import tempfile
 
     from semdb.errors import UsageError
 
@@ -193,11 +207,16 @@ def check_outputs(json_file: Path | None, report: Path | None, trajectories: Pat
         if json_file.is_dir() or not target.exists() or not os.access(target, os.W_OK):
             raise UsageError(f"--json {json_file}: cannot be written there; name a file in a folder that exists")
     for option, folder in (("--report", report), ("--trajectories", trajectories)):
+        if folder is None:
+            continue
         try:
-            if folder is not None:
-                folder.mkdir(parents=True, exist_ok=True)
+            folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise UsageError(f"{option} {folder}: the folder cannot be made: {error.strerror}") from error
+        try:
+            tempfile.TemporaryFile(dir=folder).close()
+        except OSError as error:
+            raise UsageError(f"{option} {folder}: nothing can be written there: {error.strerror}") from error
 
 
 def parse_counts(text: str | None) -> list[int | None]:

@@ -6,6 +6,7 @@ tables: 1 (frames), 2 (detector), 3 (accuracy per sequence), 4 (against learned 
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -95,11 +96,15 @@ def sequence_of(path: Path) -> PaperRow | None:
 
     Known are the names of the downloads (``rgbd_dataset_freiburg1_plant``, ``living_room_traj0_frei_png``,
     ``traj0_frei_png``, which is the office; ``traj0n`` with noise as well) and usual short ones (``fr1_plant``,
-    ``fr1/plant``, ``lr_kt0``, ``office_room/kt0``, ``icl_nuim_office_kt0``).
+    ``fr1/plant``, ``lr_kt0``, ``office_room/kt0``, ``icl_nuim_office_kt0``). A link may have the name, or what it
+    leads to.
     """
-    folder = path.resolve()
-    own, around = (re.sub(r"[-. /]+", "_", name.lower()).strip("_") for name in (folder.name, folder.parent.name))
-    return _tum_sequence(own, around) or _icl_sequence(own, around)
+    for folder in (Path(os.path.abspath(path)), path.resolve()):
+        own, around = (re.sub(r"[-. /]+", "_", name.lower()).strip("_") for name in (folder.name, folder.parent.name))
+        found = _tum_sequence(own, around) or _icl_sequence(own, around)
+        if found is not None:
+            return found
+    return None
 
 
 def _tum_sequence(own: str, around: str) -> PaperRow | None:
@@ -141,6 +146,8 @@ def counts_like(row: PaperRow, frames: int) -> Counts:
     raw, keyframes, queries = row.raw_frames or 0, row.keyframes or 0, row.test_frames or 0
     if frames >= 0.9 * raw:
         note = f"is {row.sequence} of the paper: {keyframes} keyframes and {queries} queries as in its Table 1"
+        if frames < keyframes + queries:  # its own test images must have been keyframes too
+            note += f", of which {max(0, frames - keyframes)} are no keyframes and are asked"
         return Counts(keyframes, queries, note)
     share = frames / raw
     own_keyframes, own_queries = max(1, round(share * keyframes)), max(1, round(share * queries))

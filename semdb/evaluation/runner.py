@@ -13,7 +13,7 @@ from semdb.evaluation.methods import COLMAP, SEMDB, Method, method_named
 from semdb.evaluation.metrics import EvaluationResult, QueryResult, summarise, with_other_truth
 from semdb.evaluation.protocols import PAPER, PROTOCOLS, evenly_spaced
 from semdb.evaluation.runs import Described, Describers, Run, open_run, read_frames
-from semdb.evaluation.splits import folder_plan, paper_plans, scene_plan
+from semdb.evaluation.splits import folder_plan, paper_plans, scene_plan, tell_apart
 from semdb.evaluation.tasks import GIVEN, REFINED, Plan, Task, refine_truth
 from semdb.evaluation.workspace import evaluation_store
 from semdb.evaluation.worst import PackedDetection, Shown, draw_worst
@@ -86,7 +86,7 @@ def evaluate_each(
     progress: Progress | None = None,
     say: Say | None = None,
 ) -> Iterator[Outcome]:
-    """One outcome per recording or scene and number of keyframes, as soon as it is there.
+    """One outcome per recording or scene and number of keyframes, as soon as it is there; a recording named twice once.
 
     What is wrong with one recording is the `error` of its outcome, and the others go on. Raises UsageError for what
     is wrong with the options, and ModelError where a method needs what is not installed, before anything runs.
@@ -98,16 +98,12 @@ def evaluate_each(
         try:
             plans += opening()
         except SemdbError as error:
-            if say is not None:
-                say(f"{name} is not evaluated: {error}")
             yield Outcome(name, error=error)
-    for plan in plans:
+    for plan in tell_apart(plans):
         for keyframes in options.keyframes:
             try:
                 results = _evaluate_plan(plan, keyframes, methods, settings, options, progress, say)
             except SemdbError as error:
-                if say is not None:
-                    say(f"{plan.name} is not evaluated: {error}")
                 yield Outcome(plan.name, error=error)
             else:
                 yield Outcome(plan.name, tuple(results))
@@ -122,6 +118,9 @@ def check_options(paths: Sequence[Path], options: EvaluateOptions) -> list[Metho
             raise UsageError(f"--{name} {value}: known are {', '.join(known)}")
     if options.max_queries is not None:
         evenly_spaced(0, options.max_queries)  # says now what would be wrong with it later
+    for count in options.keyframes:
+        if count is not None and count < 1:
+            raise UsageError(f"--keyframes {count}: at least one keyframe is needed")
     if options.truth != GIVEN or any(method.name == COLMAP for method in methods):
         load_pycolmap()
     by_name = options.map_from or options.query_from
@@ -129,6 +128,9 @@ def check_options(paths: Sequence[Path], options: EvaluateOptions) -> list[Metho
         raise UsageError("give either folders to evaluate one by one, or --map-from and --query-from, not both")
     if not by_name and not paths:
         raise UsageError("name the folder of a recording, or --map-from FOLDER and --query-from FOLDER")
+    if by_name and not (options.map_from and options.query_from):
+        present, absent = ("--map-from", "--query-from") if options.map_from else ("--query-from", "--map-from")
+        raise UsageError(f"{present} needs {absent} too: the one makes the map, the other is asked about")
     return methods
 
 

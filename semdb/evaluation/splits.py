@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from semdb.errors import RecordingError, UsageError
@@ -61,9 +63,6 @@ def split_lines(path: Path) -> list[int]:
 
 def folder_plan(map_from: Sequence[Path], query_from: Sequence[Path], camera: Camera | None = None) -> SplitPlan:
     """Protocol `split` of recordings in one world frame that the caller names. Raises UsageError, RecordingError."""
-    if not map_from or not query_from:
-        present, absent = ("--map-from", "--query-from") if map_from else ("--query-from", "--map-from")
-        raise UsageError(f"{present} needs {absent} too: the one makes the map, the other is asked about")
     halves = [[found for path in paths for found in open_recordings(path, camera)] for paths in (map_from, query_from)]
     same = {found.path.resolve() for found in halves[0]} & {found.path.resolve() for found in halves[1]}
     if same:
@@ -84,15 +83,44 @@ def _sequence(path: Path, name: str, number: int, camera: Camera | None) -> Reco
     raise RecordingError(f"{path / name}: names sequence{number}, but there is no folder {path / f'seq-{number:02d}'}")
 
 
+def tell_apart(plans: Sequence[Plan]) -> list[Plan]:
+    """The plans without those that come twice, each with a name of its own: files and tables go by it."""
+    once: dict[tuple[object, ...], Plan] = {}
+    for plan in plans:
+        once.setdefault((type(plan), *(_as_named(recording) for recording in plan.recordings)), plan)
+    recordings = [plan.recording for plan in once.values() if isinstance(plan, PaperPlan)]
+    _tell_apart(recordings)
+    taken = {recording.name for recording in recordings}
+    found: list[Plan] = []
+    for plan in once.values():
+        if not isinstance(plan, SplitPlan):
+            found.append(plan)
+            continue
+        found.append(replace(plan, name=_not_among(taken, plan.name)))
+        taken.add(found[-1].name)
+    return found
+
+
 def _tell_apart(recordings: Sequence[Recording]) -> None:
     """Recordings of one name get that of the folder around them in front, and a number where that is not enough."""
     names = [recording.name for recording in recordings]
     taken: set[str] = set()
     for recording in recordings:
         if names.count(recording.name) > 1:
-            recording.name = f"{recording.path.resolve().parent.name}-{recording.path.resolve().name}"
-        name, number = recording.name, 1
-        while recording.name in taken:
-            number += 1
-            recording.name = f"{name}-{number}"
+            recording.name = f"{_as_named(recording).parent.name}-{_as_named(recording).name}"
+        recording.name = _not_among(taken, recording.name)
         taken.add(recording.name)
+
+
+def _as_named(recording: Recording) -> Path:
+    """The folder as a whole path, without following links."""
+    return Path(os.path.abspath(recording.path))
+
+
+def _not_among(taken: Collection[str], name: str) -> str:
+    """`name`, with a number behind it where it is taken."""
+    number, found = 1, name
+    while found in taken:
+        number += 1
+        found = f"{name}-{number}"
+    return found

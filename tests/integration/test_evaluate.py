@@ -68,10 +68,39 @@ def test_one_recording_that_fails_costs_no_other_its_results(room: Path, tmp_pat
     assert page.count("data:image/jpeg") == 4  # all queries are among the ten to look at
 
 
-def test_nothing_evaluated_is_the_error_itself(tmp_path: Path) -> None:
-    output = evaluate(tmp_path / "missing", tmp_path / "gone", "--json", "none.json", cwd=tmp_path, code=1)
-    assert "missing: no such folder" in output
+def test_nothing_evaluated_is_the_error_itself_said_once(tmp_path: Path) -> None:
+    missing, gone = tmp_path / "missing", tmp_path / "gone"
+    assert evaluate(missing, cwd=tmp_path, code=1) == f"semdb: {missing}: no such folder\n"
+    output = evaluate(missing, gone, "--json", "none.json", cwd=tmp_path, code=1)
+    assert output == "".join(f"semdb: not evaluated: {path}: no such folder\n" for path in (missing, gone))
     assert not (tmp_path / "none.json").exists()
+
+
+def test_what_cannot_be_right_or_written_is_said_before_anything_runs(room: Path, tmp_path: Path) -> None:
+    """A sequence of the paper has its own number of keyframes, which must not hide one that makes no sense."""
+    sequence = tmp_path / "rgbd_dataset_freiburg1_plant"
+    sequence.symlink_to(room)  # its own name counts, not that of what it leads to
+    output = evaluate(sequence, "--keyframes", 0, cwd=tmp_path, code=2)
+    assert output == "semdb: --keyframes 0: at least one keyframe is needed\n"
+    output = evaluate(room, *FEW, "--report", "/proc/self", cwd=tmp_path, code=2)
+    assert output.startswith("semdb: --report /proc/self: nothing can be written there: ")
+
+
+def test_two_recordings_of_one_name_keep_their_files(room: Path, tmp_path: Path) -> None:
+    for place in ("monday", "friday"):
+        shutil.copytree(room, tmp_path / place / "desk")
+    evaluate(
+        *("monday/desk", "friday/desk", "monday/desk/", "--keyframes", 8, "--max-queries", 2, "--json", "two.json"),
+        *("--method", "sift-reference", "--trajectories", "poses"),
+        cwd=tmp_path,
+    )
+    assert [result["recording"] for result in read(tmp_path / "two.json")] == ["monday-desk", "friday-desk"]
+    assert sorted(path.name for path in (tmp_path / "poses").iterdir()) == [
+        "friday-desk-sift-reference-8-truth.txt",
+        "friday-desk-sift-reference-8.txt",
+        "monday-desk-sift-reference-8-truth.txt",
+        "monday-desk-sift-reference-8.txt",
+    ]
 
 
 @pytest.fixture(scope="module")

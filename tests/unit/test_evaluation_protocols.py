@@ -12,8 +12,8 @@ from semdb.evaluation.methods import ABLATION, METHODS, method_named
 from semdb.evaluation.metrics import QueryResult, summarise
 from semdb.evaluation.published import PAPER_SEQUENCES, counts_like, sequence_of
 from semdb.evaluation.runner import EvaluateOptions, check_options
-from semdb.evaluation.splits import folder_plan, scene_plan, split_lines
-from semdb.evaluation.tasks import PaperPlan, _proportional
+from semdb.evaluation.splits import folder_plan, paper_plans, scene_plan, split_lines, tell_apart
+from semdb.evaluation.tasks import PaperPlan, Plan, _proportional
 from semdb.evaluation.trajectories import trajectory_text, write_trajectories
 from semdb.evaluation.workspace import Workspace, is_abandoned, new_name, parse_name, this_host
 from semdb.geometry import pose_from, rotation_from_quat_wxyz
@@ -69,6 +69,17 @@ def test_counts_are_those_of_table_1_or_in_proportion() -> None:
     sixth = counts_like(row, 187)
     assert (sixth.keyframes, sixth.queries) == (29, 134)
     assert "187 of its 1120 frames" in sixth.note
+    overlapping = counts_like(PAPER_SEQUENCES["TUM freiburg2_360_hemisphere"], 2647)
+    assert (overlapping.keyframes, overlapping.queries) == (800, 2000)
+    assert overlapping.note.endswith("2000 queries as in its Table 1, of which 1847 are no keyframes and are asked")
+
+
+def test_a_link_may_have_the_name_of_a_sequence(tmp_path: Path) -> None:
+    (tmp_path / "data").mkdir()
+    (tmp_path / "fr1_plant").symlink_to(tmp_path / "data")
+    found = sequence_of(tmp_path / "fr1_plant")
+    assert found is not None
+    assert found.sequence == "TUM freiburg1_plant"
 
 
 @pytest.mark.parametrize(
@@ -149,10 +160,19 @@ def test_folders_by_name_for_a_split(tmp_path: Path) -> None:
     plan = folder_plan([first], [second])
     assert [recording.name for recording in plan.recordings] == ["a-visit", "b-visit"]
     assert plan.name == "b-visit"
-    with pytest.raises(UsageError, match="--map-from needs --query-from"):
-        folder_plan([first], [])
     with pytest.raises(UsageError, match="use --protocol paper"):
         folder_plan([first], [second, first])
+
+
+def test_recordings_of_one_name_are_told_apart_and_one_that_comes_twice_is_one(tmp_path: Path) -> None:
+    for place in ("living_room", "office_room"):
+        write_tum(tmp_path / place / "kt0")
+    paths = [tmp_path / "living_room" / "kt0", tmp_path / "office_room" / "kt0", tmp_path / "living_room" / "kt0"]
+    plans = tell_apart([plan for path in paths for plan in paper_plans(path, SMALL)])
+    assert [plan.name for plan in plans] == ["living_room-kt0", "office_room-kt0"]
+    scenes = [scene(tmp_path / place / "redkitchen") for place in ("a", "b")]
+    splits: list[Plan] = [scene_plan(path) for path in scenes]
+    assert [plan.name for plan in tell_apart(splits)] == ["redkitchen", "redkitchen-2"]
 
 
 def test_keyframes_are_shared_out_in_proportion() -> None:
@@ -170,6 +190,8 @@ def test_keyframes_are_shared_out_in_proportion() -> None:
         (EvaluateOptions(methods=("semdb+magic",)), "with query depth NAME"),
         (EvaluateOptions(methods=("colmap+depth",)), "colmap has no use for the depth"),
         (EvaluateOptions(map_from=(Path("a"),)), "not both"),
+        (EvaluateOptions(keyframes=(25, 0)), "--keyframes 0: at least one keyframe is needed"),
+        (EvaluateOptions(max_queries=0), "--max-queries 0: at least one query is needed"),
     ],
 )
 def test_options_that_make_no_sense(options: EvaluateOptions, message: str) -> None:
@@ -177,6 +199,8 @@ def test_options_that_make_no_sense(options: EvaluateOptions, message: str) -> N
         check_options([Path("room")], options)
     with pytest.raises(UsageError, match="name the folder"):
         check_options([], EvaluateOptions())
+    with pytest.raises(UsageError, match="--query-from needs --map-from too"):
+        check_options([], EvaluateOptions(query_from=(Path("a"),)))
 
 
 def test_every_row_of_the_ablation_is_a_method() -> None:
