@@ -20,6 +20,8 @@ from semdb.evaluation.plots import SERIES, style_axes
 from semdb.pictures import FAINT, INK
 from semdb.types import BoolArray, FloatArray
 
+INSIDE = 3  # series whose names have room inside the axes
+
 
 def answers(result: EvaluationResult) -> tuple[FloatArray, BoolArray]:
     """Confidence ``[n]`` of every query that has one, and whether its pose is right: within 0.25 m and 5 degrees.
@@ -49,9 +51,11 @@ def has_confidence(result: EvaluationResult) -> bool:
 def confidence_plot(series: Sequence[tuple[str, FloatArray, BoolArray]]) -> Figure:
     """Precision over recall as confidence falls, and reliability: right answers per bin of confidence.
 
-    `series` are (name, confidence ``[n]``, correct ``[n]``). Dots of the reliability plot grow with their bin.
+    `series` are (name, confidence ``[n]``, correct ``[n]``). Dots of the reliability plot grow with their bin. More
+    series than have room inside the axes are named below them.
     """
-    figure = Figure(figsize=(12.5, 5.2), layout="constrained")
+    below = len(series) > INSIDE
+    figure = Figure(figsize=(12.5, 5.2 + (0.22 * len(series) if below else 0)), layout="constrained")
     left, right = figure.subplots(1, 2)
     for axes in (left, right):
         style_axes(axes)
@@ -84,7 +88,8 @@ def confidence_plot(series: Sequence[tuple[str, FloatArray, BoolArray]]) -> Figu
     right.set_ylabel("share of answers that are right")
     for axes, place in ((left, "lower left"), (right, "lower right")):
         if axes.get_legend_handles_labels()[0]:
-            axes.legend(loc=place, labelcolor=INK, framealpha=1.0, edgecolor="white", fontsize=9, markerscale=0.6)
+            where = {"loc": "upper left", "bbox_to_anchor": (0, -0.13)} if below else {"loc": place}
+            axes.legend(**where, labelcolor=INK, framealpha=1.0, edgecolor="white", fontsize=9, markerscale=0.6)
     return figure
 
 

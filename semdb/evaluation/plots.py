@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -23,6 +24,8 @@ TRANSLATION_RANGE_M = 0.5
 ROTATION_RANGE_DEG = 10.0
 # Okabe and Ito's palette: told apart by readers with any colour vision
 SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+LINES = ("-", "--", ":", "-.")  # for the colours' second to fourth time
+LEGEND_CHARACTERS = 150  # side by side below a figure
 STAGE_COLOURS = ("#c9d0d8", "#0072B2", "#56B4E9", "#009E73", "#F0E442", "#E69F00", "#D55E00", "#CC79A7")
 GRID = "#e3e7ec"
 DPI = 110
@@ -61,7 +64,9 @@ def cumulative_plot(results: Sequence[EvaluationResult]) -> Figure:
     Shares are of all queries: one that is not localized is within nothing. The paper's own levels are marked. Below,
     the same up to 0.05 m and 2.5 degrees, where methods differ.
     """
-    figure = Figure(figsize=(12.5, 9.4), layout="constrained")
+    columns = LEGEND_CHARACTERS // (max((len(name) for name in series_names(results)), default=0) + 8)
+    columns = min(max(columns, 1), 4)
+    figure = Figure(figsize=(12.5, 9.4 + 0.24 * math.ceil(len(results) / columns)), layout="constrained")
     panels = figure.subplots(2, 2)
     for row, whole in enumerate((True, False)):
         for axes, field, reach, near, label in (
@@ -72,8 +77,17 @@ def cumulative_plot(results: Sequence[EvaluationResult]) -> Figure:
             axes.set_xlabel(label)
     for axes, paper, limit in ((panels[0][0], PAPER_TRANSLATION, "0.3 m"), (panels[0][1], PAPER_ROTATION, "2.5°")):
         _mark_paper(axes, paper, limit)
-        axes.legend(loc="lower right", labelcolor=INK, framealpha=1.0, edgecolor="white")
+    legend_below(figure, panels[0][0], columns)
     return figure
+
+
+def legend_below(figure: Figure, axes: Axes, columns: int) -> None:
+    """What the lines of `axes` are, below all axes, where it hides none of them however many they are."""
+    handles, labels = axes.get_legend_handles_labels()
+    if handles:
+        figure.legend(
+            handles, labels, loc="outside lower center", ncols=min(columns, len(handles)), frameon=False, labelcolor=INK
+        )
 
 
 def _curves(axes: Axes, results: Sequence[EvaluationResult], field: str, reach: float) -> None:
@@ -82,7 +96,7 @@ def _curves(axes: Axes, results: Sequence[EvaluationResult], field: str, reach: 
     for i, (result, name) in enumerate(zip(results, series_names(results), strict=True)):
         errors = [getattr(query, field) for query in result.per_query if query.is_localized]
         shares = cumulative_shares(errors, result.queries, x)
-        style = "-" if i < len(SERIES) else "--"
+        style = LINES[i // len(SERIES) % len(LINES)]
         axes.plot(x, shares, style, color=SERIES[i % len(SERIES)], lw=2.0, label=name, drawstyle="steps-post")
     axes.set_xlim(0, reach)
     axes.set_ylim(0, 1.02)
@@ -128,8 +142,7 @@ def timing_plot(results: Sequence[EvaluationResult]) -> Figure | None:
     axes.invert_yaxis()
     axes.set_xlim(0, 1.12 * float((left + rest).max()))
     axes.set_xlabel("milliseconds per query, median")
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.0 + 0.9 / (1.1 + 0.42 * len(known))), ncols=9, frameon=False,
-                labelcolor=INK, fontsize=9)  # fmt: skip
+    figure.legend(loc="outside upper center", ncols=9, frameon=False, labelcolor=INK, fontsize=9)
     return figure
 
 

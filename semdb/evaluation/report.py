@@ -205,15 +205,21 @@ def _optional(directory: Path, results: Sequence[EvaluationResult]) -> list[Sect
 
 
 def _confidence(directory: Path, results: Sequence[EvaluationResult]) -> str:
-    series = [(name, *answers(result)) for name, result in zip(series_names(results), results, strict=True)]
-    text = (
-        "Right: a pose within 0.25 m and 5°, whatever the verdict; wrong poses and failures are the negatives. Queries "
-        "of a recording that the map knows are nearly all right, and few negatives make rough curves (bench.trust asks "
-        "thousands): "
-        + "; ".join(f"{name}: {int((~right).sum())} wrong of {len(right)}" for name, _, right in series)
-        + "."
-    )
-    return html.note(text) + _figure(directory / "confidence.png", confidence_plot(series), "confidence")
+    """One picture per recording, as of the errors."""
+    parts = [
+        html.note(
+            "Right: a pose within 0.25 m and 5°, whatever the verdict; wrong poses and failures are the negatives. "
+            "Queries of a recording that the map knows are nearly all right, and few negatives make rough curves "
+            "(bench.trust asks thousands)."
+        )
+    ]
+    for number, recording in enumerate(dict.fromkeys(result.recording for result in results), start=1):
+        chosen = [result for result in results if result.recording == recording]
+        series = [(name, *answers(result)) for name, result in zip(series_names(chosen), chosen, strict=True)]
+        counts = "; ".join(f"{name}: {int((~right).sum())} wrong of {len(right)}" for name, _, right in series)
+        picture = _figure(directory / f"confidence-{number}.png", confidence_plot(series), f"confidence on {recording}")
+        parts += [f"<h3>{escape(recording)}</h3>", html.note(f"{counts}."), picture]
+    return "\n".join(parts)
 
 
 def _details_note() -> str:

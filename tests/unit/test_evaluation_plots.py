@@ -13,11 +13,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from rich.console import Console
 
 from semdb.errors import UsageError
 from semdb.evaluation.averages import averages
 from semdb.evaluation.comparisons import table_1, table_3, table_4
+from semdb.evaluation.confidence_plots import answers, confidence_plot
 from semdb.evaluation.failures import explain, sharpness
 from semdb.evaluation.methods import ABLATION
 from semdb.evaluation.metrics import EvaluationResult, QueryResult, error_figures, summarise
@@ -28,6 +30,7 @@ from semdb.evaluation.plots import (
     figure_png,
     inlier_plot,
     series_names,
+    timing_plot,
     trajectory_plot,
 )
 from semdb.evaluation.published import PAPER_TABLE_3
@@ -101,7 +104,29 @@ def test_curves_of_the_cumulative_plot() -> None:
     assert np.asarray(turned.get_ydata(), float)[-1] == pytest.approx(0.7)
     marks = [line.get_xydata().tolist() for line in (*left.get_lines(), *right.get_lines()) if line.get_marker() == "D"]
     assert marks == [[[0.3, 0.9]], [[2.5, 0.8]]]
-    assert [text.get_text() for text in left.get_legend().get_texts()] == ["semdb, 25 keyframes", "cnn, 25 keyframes"]
+    [legend] = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["semdb, 25 keyframes", "cnn, 25 keyframes"]
+
+
+@pytest.mark.parametrize("count", [1, 16])
+def test_legends_are_whole_and_hide_no_curve(count: int) -> None:
+    results = [result("sift-reference", 10 + n, "tum_rgbd_dataset_freiburg1_rpy") for n in range(count)]
+    confidences = [(name, *answers(one)) for name, one in zip(series_names(results), results, strict=True)]
+    timing = timing_plot([result(), *results])  # long names
+    assert timing is not None
+    for figure in (cumulative_plot(results), timing, confidence_plot(confidences)):
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        whole = figure.bbox
+        legends = [*figure.legends, *(axes.get_legend() for axes in figure.axes if axes.get_legend())]
+        assert legends
+        for legend in legends:
+            box = legend.get_window_extent()
+            assert box.x0 >= whole.x0
+            assert box.x1 <= whole.x1
+            assert box.y0 >= whole.y0
+            assert box.y1 <= whole.y1
+            assert count == 1 or not any(box.overlaps(axes.bbox) for axes in figure.axes)
 
 
 def test_curve_pixels_have_the_colour_of_the_series() -> None:
@@ -216,7 +241,7 @@ def test_report_is_complete_and_self_contained(tmp_path: Path) -> None:
     names = sorted(path.name for path in folder.iterdir())
     assert names == sorted(
         ["index.html", "results.json", "averages.json", "queries.csv", "errors-1.png", "errors-2.png", "timing.png"]
-        + ["confidence.png"]
+        + ["confidence-1.png", "confidence-2.png"]
         + [f"{kind}-{n}.png" for kind in ("trajectory", "inliers") for n in (1, 2, 3)]
     )
     assert steps == [(1, 3), (2, 3), (3, 3)]
@@ -230,7 +255,7 @@ def test_report_is_complete_and_self_contained(tmp_path: Path) -> None:
     parser.feed(text)
     assert parser.open == []
     images = [attributes for tag, attributes in parser.seen if tag == "img"]
-    assert len(images) == 2 + 1 + 1 + 2 * 3 + 1  # errors, time, confidence, two per result, one query
+    assert len(images) == 2 + 1 + 2 + 2 * 3 + 1  # errors, time, confidence, two per result, one query
     assert sum(str(image["src"]).startswith("data:image/png;base64,") for image in images) == len(images) - 1
     assert f"data:image/jpeg;base64,{base64.b64encode(picture).decode()}" in text
     assert not any(tag in ("script", "link", "iframe") for tag, _ in parser.seen)
