@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from semdb.evaluation.methods import place_of
 from semdb.evaluation.metrics import EvaluationResult
 from semdb.evaluation.published import PAPER_SEQUENCES
 
@@ -62,9 +63,9 @@ def _collection(result: EvaluationResult) -> str:
     return "" if row is None else f"{row.collection}, all"
 
 
-def _order(key: tuple[str, str, str, int | None]) -> tuple[bool, str, str, str, int]:
+def _order(key: tuple[str, str, str, int | None]) -> tuple[bool, str, str, int, str, int]:
     name, method, truth, asked = key
-    return name == ALL_RECORDINGS, name, method, truth, asked or 0
+    return name == ALL_RECORDINGS, name, truth, place_of(method), method, asked or 0
 
 
 def _is_repeated(

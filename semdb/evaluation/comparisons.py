@@ -10,6 +10,7 @@ from semdb.evaluation.formats import NOTHING, errors, percent
 from semdb.evaluation.metrics import EvaluationResult
 from semdb.evaluation.published import PAPER_SEQUENCES, PAPER_TABLE_3, PAPER_TABLE_4, PaperRow
 
+REFINED_NOTE = " (refined poses)"
 PAPER_HEADERS = ("sequence", "method", "frames", "keyframes", "queries", "median m / °", "mean m / °", "success")
 
 
@@ -45,30 +46,25 @@ def table_1(results: Sequence[EvaluationResult]) -> Grid:
 
 
 def table_3(results: Sequence[EvaluationResult], *, only_evaluated: bool = False) -> Grid:
-    """Accuracy per sequence, each of ours below the paper's; then the recordings that the paper does not have.
+    """Accuracy per sequence, each of ours below the paper's; then means; then what the paper does not have.
 
     With `only_evaluated`, without the sequences that this run does not have.
     """
-    means = averages(results)
     known = {result.sequence for result in results}
     rows: list[tuple[str, ...]] = []
     ours: set[int] = set()
-    for row in PAPER_TABLE_3:
-        own_means = [mean for mean in means if mean.name == row.sequence] if row.test_frames is None else []
-        collection = {PAPER_SEQUENCES[name].collection for name in known if name in PAPER_SEQUENCES}
-        evaluated = row.sequence in known if row.test_frames is not None else row.collection in collection
-        if only_evaluated and not evaluated:
+    for row in (row for row in PAPER_TABLE_3 if row.test_frames is not None):
+        if only_evaluated and row.sequence not in known:
             continue
-        rows.append(_paper_cells(row))
-        if row.test_frames is not None:
-            own = [_own_cells(result) for result in results if result.sequence == row.sequence]
-        else:
-            own = [_mean_cells(mean) for mean in own_means] if row.method == "the paper" else []
-        ours |= set(range(len(rows), len(rows) + len(own)))
-        rows += own
-    rest = [] if only_evaluated else [_own_cells(result) for result in results if result.sequence is None]
-    ours |= set(range(len(rows), len(rows) + len(rest)))
-    rows += rest
+        own = [_own_cells(result) for result in results if result.sequence == row.sequence]
+        _add(rows, ours, [row], own)
+    collections = {PAPER_SEQUENCES[name].collection for name in known if name in PAPER_SEQUENCES}
+    for name in dict.fromkeys(row.sequence for row in PAPER_TABLE_3 if row.test_frames is None):
+        whole = [row for row in PAPER_TABLE_3 if row.sequence == name]
+        if only_evaluated and whole[0].collection not in collections:
+            continue
+        _add(rows, ours, whole, [_mean_cells(mean) for mean in averages(results) if mean.name == name])
+    _add(rows, ours, [], [] if only_evaluated else [_own_cells(result) for result in results if not result.sequence])
     return Grid(
         "Table 3: accuracy",
         PAPER_HEADERS,
@@ -78,6 +74,15 @@ def table_3(results: Sequence[EvaluationResult], *, only_evaluated: bool = False
         "averages only.",
         ours=frozenset(ours),
     )
+
+
+def _add(
+    rows: list[tuple[str, ...]], ours: set[int], published: Sequence[PaperRow], own: Sequence[tuple[str, ...]]
+) -> None:
+    """Published rows with our own below, whose positions go into `ours`."""
+    rows += [_paper_cells(row) for row in published]
+    ours |= set(range(len(rows), len(rows) + len(own)))
+    rows += own
 
 
 def paper_rows_evaluated(results: Sequence[EvaluationResult]) -> Grid:
@@ -95,26 +100,14 @@ def table_4(results: Sequence[EvaluationResult]) -> Grid:
         for row in PAPER_TABLE_4
     ]  # fmt: skip
     count = len(rows)
-    methods = dict.fromkeys(
-        (result.method, result.truth) for result in results if "ICL-NUIM" in (result.sequence or "")
-    )
-    for method, truth in methods:
-        cells = []
-        for room in ("living", "office"):
-            chosen = [
-                result
-                for result in results
-                if (result.method, result.truth) == (method, truth) and f"ICL-NUIM {room}" in (result.sequence or "")
-            ]
-            number = len({result.sequence for result in chosen})
-            mean = errors(
-                plain_mean(result.mean_translation_m for result in chosen),
-                plain_mean(result.mean_rotation_deg for result in chosen),
-            )
-            cells.append(mean if number in (0, 4) else f"{mean} ({number} of 4)")
-        rows.append((f"{method}, this run", cells[0], cells[1]))
+    kinds = dict.fromkeys(_kind(result) for result in results if "ICL-NUIM" in (result.sequence or ""))
+    for method, truth, asked in kinds:
+        alike = [result for result in results if _kind(result) == (method, truth, asked)]
+        name = f"{method}{REFINED_NOTE if truth == 'refined' else ''}, this run"
+        name += "" if asked is None else f", {asked} keyframes each"
+        rows.append((name, _room_mean(alike, "living"), _room_mean(alike, "office")))
     note = "Networks that regress a pose, trained on each room; mean over the four sequences of each room."
-    if not methods:
+    if not kinds:
         note += " This run has no sequence of ICL-NUIM."
     return Grid(
         "Table 4: mean error on ICL-NUIM, m / °",
@@ -124,6 +117,21 @@ def table_4(results: Sequence[EvaluationResult]) -> Grid:
         text_columns=1,
         ours=frozenset(range(count, len(rows))),
     )
+
+
+def _kind(result: EvaluationResult) -> tuple[str, str, int | None]:
+    """What must be the same in results that are averaged."""
+    return result.method, result.truth, result.keyframes_asked
+
+
+def _room_mean(results: Sequence[EvaluationResult], room: str) -> str:
+    chosen = [result for result in results if f"ICL-NUIM {room}" in (result.sequence or "")]
+    number = len({result.sequence for result in chosen})
+    mean = errors(
+        plain_mean(result.mean_translation_m for result in chosen),
+        plain_mean(result.mean_rotation_deg for result in chosen),
+    )
+    return mean if number in (0, 4) else f"{mean} ({number} of 4)"
 
 
 def _paper_cells(row: PaperRow) -> tuple[str, ...]:
@@ -140,7 +148,7 @@ def _paper_cells(row: PaperRow) -> tuple[str, ...]:
 def _own_cells(result: EvaluationResult) -> tuple[str, ...]:
     return (
         result.sequence or result.recording,
-        result.method + (" (refined poses)" if result.truth == "refined" else ""),
+        result.method + (REFINED_NOTE if result.truth == "refined" else ""),
         str(result.frames),
         str(result.keyframes),
         str(result.queries),
@@ -153,7 +161,7 @@ def _own_cells(result: EvaluationResult) -> tuple[str, ...]:
 def _mean_cells(mean: Average) -> tuple[str, ...]:
     return (
         f"{mean.name.removesuffix(', all')}, mean of {mean.sequences}",
-        mean.method + (" (refined poses)" if mean.truth == "refined" else ""),
+        mean.method + (REFINED_NOTE if mean.truth == "refined" else ""),
         NOTHING,
         str(mean.keyframes),
         str(mean.queries),

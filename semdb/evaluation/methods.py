@@ -56,6 +56,7 @@ _PAPER_FILTER = CoarseOptions(
 )
 # The same with the whole budget of the default cascade, 10 keyframes, spent on what passes.
 _HARD = replace(_PAPER_FILTER, filtered_batches=(1, 2, 3, 4))
+_CLASSLESS = MatchingOptions(contradiction_ratio=MatchingOptions().ratio)  # a pair of two classes is like any other
 _ON_OBJECTS = PoseOptions(matching=MatchingOptions(evidence=Evidence.OBJECTS), guided=False)
 
 METHODS = {
@@ -84,7 +85,7 @@ METHODS = {
             "Chen et al.: best cosine over the whole database, ORB matches over the whole image, PnP",
             LocalizerOptions(
                 coarse=CoarseOptions(use_classes=False, filtered_batches=(1,), soft_batches=(), all_batches=()),
-                pose=PoseOptions(guided=False, bundle=False),
+                pose=PoseOptions(matching=_CLASSLESS, guided=False, bundle=False),
                 verdict=_COUNT_ONLY,
                 neighbours=0,
                 twins=0,
@@ -154,3 +155,8 @@ def method_named(name: str) -> Method:
     if plain in COLOUR_ONLY:
         raise UsageError(f"--method {name}: {plain} has no use for the depth of queries")
     return replace(METHODS[plain], name=name, query_depth=True)
+
+
+def place_of(name: str) -> int:
+    """Where a method stands in tables: as in `METHODS`, with depth where it is without."""
+    return list(METHODS).index(plain) if (plain := name.removesuffix(WITH_DEPTH)) in METHODS else len(METHODS)

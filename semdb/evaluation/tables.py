@@ -11,7 +11,7 @@ from rich.table import Table
 from semdb.evaluation.averages import Average, averages
 from semdb.evaluation.comparisons import Grid, paper_rows_evaluated
 from semdb.evaluation.formats import NOTHING, errors, percent, whole
-from semdb.evaluation.methods import ABLATION, METHODS, WITH_DEPTH
+from semdb.evaluation.methods import ABLATION, place_of
 from semdb.evaluation.metrics import EvaluationResult
 
 HEADERS = (
@@ -102,11 +102,9 @@ def results_markdown(results: Sequence[EvaluationResult]) -> str:
 
 def by_keyframes(results: Sequence[EvaluationResult]) -> list[EvaluationResult]:
     """By recording, method (in the order of `METHODS`) and number of keyframes, given poses before refined ones."""
-    order = {name: place for place, name in enumerate(METHODS)}
 
     def key(result: EvaluationResult) -> tuple[str, str, int, str, int]:
-        plain = result.method.removesuffix(WITH_DEPTH)
-        return result.recording, result.truth, order.get(plain, len(order)), result.method, result.keyframes
+        return result.recording, result.truth, place_of(result.method), result.method, result.keyframes
 
     return sorted(results, key=key)
 

@@ -305,14 +305,19 @@ def test_sequences_of_the_paper_stand_below_its_rows() -> None:
         ("ICL-NUIM living room kt1", "the paper"),
         ("ICL-NUIM living room kt1", "semdb"),
         ("ICL-NUIM, all", "the paper"),
-        ("ICL-NUIM, mean of 2", "semdb"),
         ("ICL-NUIM, all", "Chen et al."),
+        ("ICL-NUIM, mean of 2", "semdb"),
     ]
-    assert grid.ours == {1, 3, 5}
-    assert grid.rows[5][5] == "0.0300 / 0.90"
+    assert grid.ours == {1, 3, 6}
+    assert grid.rows[6][5] == "0.0300 / 0.90"
     assert len(table_3([kt0, result(recording="desk")]).rows) == len(PAPER_TABLE_3) + 2
     rooms = table_4([kt0, kt1])
     assert rooms.rows[-1] == ("semdb, this run", "0.1100 / 2.20 (2 of 4)", "-")
+    other = replace(kt0, truth="refined", keyframes_asked=12, mean_translation_m=0.5)
+    assert table_4([kt0, other]).rows[-2:] == [
+        ("semdb, this run", "0.1100 / 2.20 (1 of 4)", "-"),
+        ("semdb (refined poses), this run, 12 keyframes each", "0.5000 / 2.20 (1 of 4)", "-"),
+    ]
     assert table_1([kt0]).rows[-1] == ("ICL-NUIM living room kt0", "this run", "250", "25", "10")
 
 
@@ -326,6 +331,8 @@ def test_averages_are_plain_means_over_recordings() -> None:
     assert averages([room, replace(desk, method="cnn")]) == []
     assert averages([room, replace(desk, median_translation_m=None)])[0].median_translation_m is None
     assert average_grid(averages([room, desk])).rows[0][:3] == ("all recordings", "semdb", "2")
+    mixed = averages([replace(one, method=name) for one in (room, desk) for name in ("chen", "paper", "semdb+depth")])
+    assert [mean.method for mean in mixed] == ["semdb+depth", "paper", "chen"]
     assert retrieval_grid([room]).rows == []
     assert "all recordings" in printed(rich_table(average_grid([mean])), 200)
 

@@ -217,6 +217,14 @@ def test_every_row_of_the_ablation_is_a_method() -> None:
     assert (deep.name, deep.query_depth, deep.options) == ("semdb+depth", True, METHODS["semdb"].options)
 
 
+def test_chen_knows_no_classes() -> None:
+    """Pairs of keypoints on objects of different classes pass the same ratio test as all others."""
+    options = METHODS["chen"].options
+    assert options.pose.matching.contradiction_ratio == options.pose.matching.ratio == 0.85
+    assert not options.coarse.use_classes
+    assert METHODS["cnn"].options.pose.matching.contradiction_ratio == 0.75  # as semdb but for the coarse step
+
+
 def answered(index: int, time_ns: int | None, verdict: Verdict = Verdict.LOCALIZED) -> QueryResult:
     estimate = None if verdict is Verdict.FAILED else pose(index)
     return QueryResult(
