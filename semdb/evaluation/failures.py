@@ -55,7 +55,10 @@ def _step(query: QueryResult) -> str:
         )
     else:
         first = ""
-    return "; ".join(part for part in (first, _end(query)) if part)
+    end = _end(query)
+    if not first and near and query.is_localized and not query.is_false:
+        end += f"; the nearest keyframe is {near}"
+    return "; ".join(part for part in (first, end) if part)
 
 
 def _end(query: QueryResult) -> str:

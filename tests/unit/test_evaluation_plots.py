@@ -359,6 +359,9 @@ def test_order_of_the_worst_and_why() -> None:
     )
     missed = replace(wrong, retrieves=True, retrieval_rank=None)
     assert explain(missed).startswith("retrieval missed: no keyframe within 0.3 m and 20°")
+    assert explain(replace(wrong, translation_m=0.04, rotation_deg=0.8)) == (
+        "right, but among the largest errors; the nearest keyframe is 0.10 m and 3° away"
+    )
     late = replace(wrong, retrieves=True, retrieval_rank=7)
     assert explain(late).startswith("the right keyframe was number 7 in the ranking, but only 3 were matched")
     edges = np.zeros((40, 40, 3), np.uint8)
