@@ -8,6 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
+from semdb.errors import RecordingError
 from semdb.evaluation.protocols import PAPER, SPLIT, evenly_spaced, split_paper
 from semdb.evaluation.published import PaperRow, counts_like, sequence_of
 from semdb.evaluation.refined_truth import Disagreement, disagreement, refine_poses
@@ -145,6 +146,9 @@ class SplitPlan:
             for entry in recording.entries
             if entry.world_from_camera is not None
         ]
+        if not posed:
+            names = ", ".join(recording.name for recording in self.query_recordings)
+            raise RecordingError(f"{names}: no frame has a pose, so no answer could be compared with the true one")
         if max_queries is not None:
             posed = [posed[position] for position in evenly_spaced(len(posed), max_queries)]
         queries = tuple(

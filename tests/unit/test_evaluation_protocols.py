@@ -164,6 +164,13 @@ def test_folders_by_name_for_a_split(tmp_path: Path) -> None:
         folder_plan([first], [second, first])
 
 
+def test_a_split_needs_true_poses_of_its_queries(tmp_path: Path) -> None:
+    known, unknown = write_tum(tmp_path / "known"), write_tum(tmp_path / "unknown")
+    (unknown / "groundtruth.txt").unlink()
+    with pytest.raises(RecordingError, match="unknown: no frame has a pose, so no answer could be compared"):
+        folder_plan([known], [unknown]).choose(2, None, None, None)
+
+
 def test_recordings_of_one_name_are_told_apart_and_one_that_comes_twice_is_one(tmp_path: Path) -> None:
     for place in ("living_room", "office_room"):
         write_tum(tmp_path / place / "kt0")
