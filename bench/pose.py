@@ -38,7 +38,7 @@ from semdb.geometry import invert_pose, pose_error, pose_from, so3_exp
 from semdb.keyframes import select_keyframes
 from semdb.localization.bundle import pixel_sigma
 from semdb.localization.pairs import join_pairs, world_points_of
-from semdb.localization.pose import PoseOptions, estimate_pose, match_view
+from semdb.localization.pose import PoseOptions, estimate_pose, match_views
 from semdb.localization.views import ClassNumbers, KeyframeView, View, make_keyframe_view, make_view
 from semdb.perception.features.surf_features import SurfFeatures
 from semdb.perception.lifting import lift
@@ -117,7 +117,7 @@ def grey_of(frame: Frame) -> ImageArray:
 
 def by_semdb(query: View, keyframes: Sequence[KeyframeView]) -> Found:
     started = clock()
-    matches = [match_view(query, keyframe, OPTIONS.matching) for keyframe in keyframes]
+    matches = match_views(query, keyframes, OPTIONS)
     matched = clock()
     estimate = estimate_pose(query, keyframes, matches, OPTIONS)
     return None if estimate is None else estimate.world_from_camera, spent_since(started, matched)
@@ -125,7 +125,7 @@ def by_semdb(query: View, keyframes: Sequence[KeyframeView]) -> Found:
 
 def by_pycolmap(query: View, keyframes: Sequence[KeyframeView]) -> Found:
     started = clock()
-    matches = [match_view(query, keyframe, OPTIONS.matching) for keyframe in keyframes]
+    matches = match_views(query, keyframes, OPTIONS)
     pairs = join_pairs(matches)
     points = world_points_of(pairs, keyframes)
     matched = clock()

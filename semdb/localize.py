@@ -70,7 +70,8 @@ def make_localizer(
 ) -> Localizer:
     """The localizer of one map. Raises UsageError for a `coarse` that is neither ``sql`` nor ``index``.
 
-    With `settings` an index is kept in their cache folder; without, it lives in memory alone.
+    With `settings` an index is kept in their cache folder, and a query has as many threads as they say; without, it
+    lives in memory alone.
     """
     check_coarse(coarse)
     source = SqlSource(store, info.id) if coarse == "sql" else IndexSource(open_index(store, info.id, settings, say))
@@ -79,6 +80,9 @@ def make_localizer(
         say(f"map {info.name!r} has changed since semdb refine; the class confusions of then are used")
     for found in store.class_confusions(info.id):
         confusions.setdefault(found.category, {})[found.other] = found.weight
+    if settings is not None:
+        given = options or LocalizerOptions()
+        options = replace(given, pose=replace(given.pose, threads=settings.threads))
     cache = KeyframeCache(store, info.id, refined=options is None or options.refined_points)
     if say is not None and cache.points == STALE:
         say(f"map {info.name!r} has changed since semdb refine; its refined points are not used: run semdb refine")

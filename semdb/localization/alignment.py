@@ -14,6 +14,7 @@ import numpy as np
 
 from semdb.geometry import invert_pose, pixels_to_normalized, transform_points
 from semdb.localization.bundle import QUERY, BundleResult
+from semdb.localization.threads import each
 from semdb.localization.views import KeyframeView, View
 from semdb.types import BoolArray, FloatArray, IntArray
 
@@ -37,6 +38,7 @@ def align_pairs(
     slots: IntArray,
     keypoints: IntArray,
     adjusted: BundleResult,
+    threads: int = 1,
 ) -> Alignment:
     """Aligns pairs of the query's keypoint ``rows[n]`` with keypoint ``keypoints[n]`` of keyframe ``slots[n]``.
 
@@ -47,11 +49,11 @@ def align_pairs(
 
     seen = query.seen_xy[rows].astype(np.float64)
     found = np.zeros(len(rows), np.bool_)
-    for slot, keyframe in enumerate(keyframes):
-        here = np.flatnonzero(slots == slot)
-        view = keyframe.view
+
+    def align(slot: int) -> None:  # writes the pairs of this keyframe alone
+        view, here = keyframes[slot].view, np.flatnonzero(slots == slot)
         if query.grey is None or view.grey is None or not len(here):
-            continue
+            return
         chosen = keypoints[here]
         relative = adjusted.image_from_world[QUERY] @ invert_pose(adjusted.image_from_world[slot + 1])
         warp, step = patch_warps(query, view, chosen, relative), patch_steps(view, chosen)
@@ -60,6 +62,8 @@ def align_pairs(
         align_patches(view.grey, query.grey, at, warp, step, seen[here], answer, likeness)
         good = likeness > LEAST_LIKENESS
         seen[here[good]], found[here[good]] = answer[good], True
+
+    each(align, range(len(keyframes)), threads)
     xy = query.xy[rows].copy()
     xy[found] = pixels_to_normalized(query.camera, seen[found])
     found &= np.isfinite(xy).all(axis=1)

@@ -33,7 +33,7 @@ from semdb.localization.pose import (
     PoseOptions,
     estimate_pose,
     first_pose,
-    match_view,
+    match_views,
     rival_pose,
 )
 from semdb.localization.verdict import Judgement, VerdictOptions, convinces, judge
@@ -161,9 +161,9 @@ class Localizer:
 
     def _match(self, search: _Search, keyframe_ids: Sequence[int]) -> None:
         started = time.perf_counter()
-        for keyframe in self.cache.views(keyframe_ids):
-            search.keyframes.append(keyframe)
-            search.matches.append(match_view(search.query, keyframe, self.options.pose.matching))
+        keyframes = self.cache.views(keyframe_ids)
+        search.keyframes += keyframes
+        search.matches += match_views(search.query, keyframes, self.options.pose)
         search.timing_ms["match"] += _ms_since(started)
 
     def _conclude(self, search: _Search) -> Localization:

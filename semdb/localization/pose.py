@@ -15,6 +15,7 @@ from semdb.localization.alignment import Alignment, align_pairs
 from semdb.localization.bundle import BundleResult, MotionPrior
 from semdb.localization.matching import Matches, MatchingOptions, match_keypoints
 from semdb.localization.pairs import Pairs, guided_pairs, join_pairs, reprojection_px, world_points_of
+from semdb.localization.threads import cores, each
 from semdb.localization.views import KeyframeView, View
 from semdb.types import BoolArray, FloatArray, IntArray
 
@@ -38,6 +39,7 @@ class PoseOptions:
     bundle: bool = True
     use_query_depth: bool = True
     motion: MotionPrior = field(default_factory=MotionPrior)
+    threads: int = field(default_factory=cores)  # keyframes are worked on side by side
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +65,9 @@ class FirstPose:
     first: FirstSupport
     inliers: int
     spread: float
+    guided: tuple[Pairs, FloatArray] | None = (
+        None  # pairs near where it projects the keyframes' points, and their points
+    )
 
     @property
     def world_from_camera(self) -> FloatArray:
@@ -93,6 +98,11 @@ class PoseEstimate:
     residual_px: float  # median reprojection error of the inliers
     spread: float  # 0..1: share of a 4x4 grid over the image that holds inliers
     aligned: int = 0  # pairs whose patches are alike to a fraction of a pixel; 0 without images
+
+
+def match_views(query: View, keyframes: Sequence[KeyframeView], options: PoseOptions) -> list[Matches]:
+    """First matching with each of `keyframes`, without a pose."""
+    return each(lambda keyframe: match_view(query, keyframe, options.matching), keyframes, options.threads)
 
 
 def match_view(query: View, keyframe: KeyframeView, options: MatchingOptions) -> Matches:
@@ -148,11 +158,11 @@ def first_pose(
         return None
     camera_from_world, agreeing = found
     first = _first_support(pairs, agreeing)
-    if options.guided:
-        pairs, points = _guided_by_pose(query, keyframes, camera_from_world, options)
+    guided = _guided_by_pose(query, keyframes, camera_from_world, options) if options.guided else None
+    pairs, points = guided or (pairs, points)
     error = reprojection_px(query, camera_from_world, pairs.query, points)
     rows = pairs.query[error < options.inlier_px]
-    return FirstPose(camera_from_world, len(keyframes), first, len(np.unique(rows)), image_spread(query, rows))
+    return FirstPose(camera_from_world, len(keyframes), first, len(np.unique(rows)), image_spread(query, rows), guided)
 
 
 def estimate_pose(
@@ -180,7 +190,8 @@ def estimate_pose(
     if start.keyframes < len(keyframes) and agreeing.any():
         first = _first_support(pairs, agreeing)
     if options.guided:
-        pairs, points = _guided_by_pose(query, keyframes, camera_from_world, options)
+        known = start.guided if start.keyframes == len(keyframes) else None
+        pairs, points = known or _guided_by_pose(query, keyframes, camera_from_world, options)
         agreeing = reprojection_px(query, camera_from_world, pairs.query, points) < options.max_reprojection_px
     if agreeing.sum() < MINIMUM_PAIRS:
         return None
@@ -254,7 +265,7 @@ def _refine(
     if agreeing.sum() < MINIMUM_PAIRS:
         raise np.linalg.LinAlgError("too few pairs are left")
     used, points = pairs.take(agreeing), world_points_of(pairs, keyframes)[agreeing]
-    alignment = align_pairs(query, keyframes, used.query, used.slot, used.keypoint, adjusted)
+    alignment = align_pairs(query, keyframes, used.query, used.slot, used.keypoint, adjusted, options.threads)
     pose = adjusted.camera_from_world
     adjusted = bundle_adjust(query, keyframes, used, points, pose, options, alignment, start=adjusted)
     aligned = int(np.count_nonzero(alignment.found))

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from semdb.errors import ModelError
+from semdb.errors import ModelError, UsageError
 from semdb.perception.features import KNOWN, load_features
 from semdb.settings import Settings
 from semdb.types import Features, ImageArray
@@ -149,5 +149,5 @@ def test_what_is_no_grey_image_is_refused(spec: str) -> None:
 
 
 def test_unknown_spec_names_the_known_ones() -> None:
-    with pytest.raises(ModelError, match="surf, sift, orb"):
+    with pytest.raises(UsageError, match="surf, sift, orb"):
         load_features("brisk", settings())

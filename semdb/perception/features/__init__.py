@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from semdb.errors import ModelError
+from semdb.errors import UsageError
 from semdb.perception.protocols import FeatureExtractor
 from semdb.settings import Settings
 
@@ -12,7 +12,7 @@ KNOWN = ("surf", "sift", "orb")
 def load_features(spec: str, settings: Settings) -> FeatureExtractor:
     """The local feature of a `spec`: ``surf``, ``sift`` or ``orb``, with at most ``settings.max_keypoints`` per image.
 
-    Raises ModelError for another spec.
+    Raises UsageError for another spec.
     """
     if spec == "surf":
         from semdb.perception.features.surf_features import SurfFeatures
@@ -26,4 +26,4 @@ def load_features(spec: str, settings: Settings) -> FeatureExtractor:
         from semdb.perception.features.orb import OrbFeatures
 
         return OrbFeatures(max_keypoints=settings.max_keypoints)
-    raise ModelError(f"no local feature {spec!r}: SEMDB_FEATURES knows {', '.join(KNOWN)}")
+    raise UsageError(f"no local feature {spec!r}: SEMDB_FEATURES knows {', '.join(KNOWN)}")

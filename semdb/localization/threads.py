@@ -1,0 +1,35 @@
+"""The keyframes of one query side by side: compiled kernels leave the interpreter to other threads meanwhile."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from typing import TypeVar
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+MOST = 4  # a query has few keyframes
+
+
+def cores() -> int:
+    """Processors that this process may use, at most `MOST`."""
+    return min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, MOST)
+
+
+def each(work: Callable[[Item], Result], items: Sequence[Item], threads: int) -> list[Result]:
+    """``[work(item) for item in items]`` on up to `threads` threads, the calling one among them.
+
+    Results are those of one thread. The first error of an item is raised.
+    """
+    if threads < 2 or len(items) < 2:
+        return [work(item) for item in items]
+    others = [_pool(threads - 1).submit(work, item) for item in items[1:]]
+    return [work(items[0]), *(other.result() for other in others)]
+
+
+@lru_cache(maxsize=MOST)
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="semdb-query")
