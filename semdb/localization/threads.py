@@ -33,3 +33,7 @@ def each(work: Callable[[Item], Result], items: Sequence[Item], threads: int) ->
 @lru_cache(maxsize=MOST)
 def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="semdb-query")
+
+
+if hasattr(os, "register_at_fork"):  # a forked process has the pool, but none of its threads
+    os.register_at_fork(after_in_child=_pool.cache_clear)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import threading
 from dataclasses import replace
 
@@ -38,6 +40,20 @@ def test_one_thread_is_the_calling_one(threads: int) -> None:
 def test_the_first_error_is_raised() -> None:
     with pytest.raises(ZeroDivisionError):
         each(lambda item: 1 // item, [2, 1, 0], 2)
+
+
+def test_a_forked_process_has_threads_of_its_own() -> None:
+    assert each(lambda item: item + 1, range(3), 2) == [1, 2, 3]
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:  # would wait for ever for threads that it does not have
+        signal.alarm(20)
+        os.write(writing, bytes(each(lambda item: item + 1, range(3), 2)))
+        os._exit(0)
+    os.close(writing)
+    assert os.waitpid(child, 0)[1] == 0
+    assert os.read(reading, 10) == bytes([1, 2, 3])
+    os.close(reading)
 
 
 def test_a_pose_does_not_depend_on_threads() -> None:
