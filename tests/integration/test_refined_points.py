@@ -86,8 +86,10 @@ def test_points_that_are_missing_are_found(store: Store, views: tuple[list[Keyfr
         assert tuple(row) == (len(truth), int((np.isfinite(found[:, 2]) & ~missing).sum()), int(missing.sum()))
     assert len(errors) > 200
     assert np.median(errors) < 0.005
-    with_points = make_localizer(store, info, "sql").localize(query)
-    without = make_localizer(store, info, "sql", LocalizerOptions(refined_points=False)).localize(query)
+    # one neighbour each: more of them bring points of their own where depth is missing
+    one, own = LocalizerOptions(neighbours=1), LocalizerOptions(neighbours=1, refined_points=False)
+    with_points = make_localizer(store, info, "sql", one).localize(query)
+    without = make_localizer(store, info, "sql", own).localize(query)
     assert (with_points.refinements, without.refinements) == ({"points": "used"}, {"points": "off"})
     assert with_points.inliers > 1.2 * without.inliers
 
