@@ -8,6 +8,8 @@ import numpy as np
 
 from semdb.compiled import kernel
 
+BLOCK = 128  # columns that are looked at together
+
 
 @kernel(fastmath=True)
 def multiply(first: Any, second: Any, out: Any) -> None:
@@ -52,25 +54,38 @@ def scan_all(closeness: Any, nearest: Any, best: Any, second: Any, best_back: An
     """Of each row of `closeness` ``[n, m]`` the greatest, where it is, and the second greatest.
 
     `best_back` gets the greatest of each column. Of equal ones the first is the nearest. Without a second it is
-    -1e38. The matrix must be finite and have a column; it is as it was when this returns.
+    -1e38. The matrix must be finite and have a column.
     """
-    least = np.float32(-1.0e38)
+    least, columns = np.float32(-1.0e38), closeness.shape[1]
     best_back[:] = least
+    blocks = (columns + BLOCK - 1) // BLOCK
+    tops = np.empty(blocks, np.float32)  # the greatest of each block: the second greatest needs no second pass
     for i in range(closeness.shape[0]):
         line = closeness[i]
         greatest = least
-        for j in range(line.size):
-            value = line[j]
-            greatest = max(greatest, value)
-            best_back[j] = max(best_back[j], value)
-        at = 0
-        while at + 1 < line.size and line[at] < greatest:
+        for block in range(blocks):
+            top = least
+            for j in range(block * BLOCK, min(columns, (block + 1) * BLOCK)):
+                value = line[j]
+                top = max(top, value)
+                best_back[j] = max(best_back[j], value)
+            tops[block] = top
+            greatest = max(greatest, top)
+        first = 0
+        while first + 1 < blocks and tops[first] < greatest:
+            first += 1
+        start, stop = first * BLOCK, min(columns, (first + 1) * BLOCK)
+        at = start
+        while at + 1 < stop and line[at] < greatest:
             at += 1
-        line[at] = least
         following = least
-        for j in range(line.size):
+        for j in range(start, at):
             following = max(following, line[j])
-        line[at] = greatest
+        for j in range(at + 1, stop):
+            following = max(following, line[j])
+        for block in range(blocks):
+            if block != first:
+                following = max(following, tops[block])
         nearest[i], best[i], second[i] = at, greatest, following
 
 

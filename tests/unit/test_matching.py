@@ -186,3 +186,20 @@ def test_near_pairs_are_those_of_a_search_of_all(seed: int, n: int, m: int, radi
         own = np.sort(values[i[:found] == group])
         assert least[group] == (own[0] if len(own) else np.inf)
         assert second[group] == (own[1] if len(own) > 1 else np.inf)
+
+
+@pytest.mark.parametrize("columns", [1, 2, 127, 128, 129, 300])
+def test_the_two_greatest_of_rows_and_the_greatest_of_columns(columns: int) -> None:
+    """Whatever block of columns they are in, and of equal ones the first."""
+    random = np.random.default_rng(columns)
+    close = random.integers(-50, 50, (40, columns)).astype(np.float32)  # many are equal
+    nearest, best, second = np.empty(40, np.int32), np.empty(40, np.float32), np.empty(40, np.float32)
+    best_back = np.empty(columns, np.float32)
+    kept = close.copy()
+    scan_all(close, nearest, best, second, best_back)
+    np.testing.assert_array_equal(close, kept)
+    np.testing.assert_array_equal(nearest, close.argmax(axis=1))
+    np.testing.assert_array_equal(best, close.max(axis=1))
+    np.testing.assert_array_equal(best_back, close.max(axis=0))
+    expected = np.sort(close, axis=1)[:, -2] if columns > 1 else np.full(40, -1.0e38, np.float32)
+    np.testing.assert_array_equal(second, expected)
