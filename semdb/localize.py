@@ -81,8 +81,7 @@ def make_localizer(
     for found in store.class_confusions(info.id):
         confusions.setdefault(found.category, {})[found.other] = found.weight
     if settings is not None:
-        given = options or LocalizerOptions()
-        options = replace(given, pose=replace(given.pose, threads=settings.threads))
+        options = (options or LocalizerOptions()).with_threads(settings.threads)
     cache = KeyframeCache(store, info.id, refined=options is None or options.refined_points)
     if say is not None and cache.points == STALE:
         say(f"map {info.name!r} has changed since semdb refine; its refined points are not used: run semdb refine")

@@ -32,7 +32,7 @@ class Describers:
 
     def __init__(self, detector: str, encoder: str, features: str, settings: Settings) -> None:
         self._default = features
-        self._settings = settings
+        self.settings = settings
         self._made = {features: describer_from_specs(detector, encoder, features, settings)}
 
     def of(self, method: Method) -> Describer:
@@ -42,7 +42,7 @@ class Describers:
 
             first = self._made[self._default]
             self._made[name] = Describer(
-                first.detector, first.encoder, load_features(name, self._settings), first.rules, first.batch
+                first.detector, first.encoder, load_features(name, self.settings), first.rules, first.batch
             )
         return self._made[name]
 
@@ -221,7 +221,8 @@ def open_run(
     map_name = describer.features.info.name  # one map per kind of features: rows of two kinds do not mix
     if all(info.name != map_name for info in store.maps()):
         _fill(map_name, task, describer, store, progress)
-    localizer = make_localizer(store, store.find_map(map_name), coarse, method.options)
+    options = method.options.with_threads(describers.settings.threads)
+    localizer = make_localizer(store, store.find_map(map_name), coarse, options)
     run = OracleRun if method.name.startswith(ORACLE) else LocalizerRun
     return run(method, describer, localizer, query_depth or method.query_depth, store)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -55,6 +55,10 @@ class LocalizerOptions:
     twins: int = 1  # keyframes far from the pose that are asked when they look as much like the query
     refined_points: bool = True  # those of `semdb refine`, where the map has not changed since
     twin_cosine: float = 0.05  # how much less than the best keyframe's cosine is "as much"
+
+    def with_threads(self, threads: int) -> LocalizerOptions:
+        """The same with so many threads for a query."""
+        return replace(self, pose=replace(self.pose, threads=threads))
 
 
 @dataclass(slots=True)

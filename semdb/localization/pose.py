@@ -65,9 +65,7 @@ class FirstPose:
     first: FirstSupport
     inliers: int
     spread: float
-    guided: tuple[Pairs, FloatArray] | None = (
-        None  # pairs near where it projects the keyframes' points, and their points
-    )
+    guided: tuple[Pairs, FloatArray] | None = None  # pairs near its projections, and their points
 
     @property
     def world_from_camera(self) -> FloatArray:

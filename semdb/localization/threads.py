@@ -1,4 +1,4 @@
-"""The keyframes of one query side by side: compiled kernels leave the interpreter to other threads meanwhile."""
+"""Parts of one query side by side: compiled kernels leave the interpreter to other threads meanwhile."""
 
 from __future__ import annotations
 

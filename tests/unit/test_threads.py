@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from semdb.localization.localizer import LocalizerOptions
 from semdb.localization.pose import PoseOptions, estimate_pose, match_views
 from semdb.localization.threads import MOST, cores, each
 from semdb.localization.views import ClassNumbers
@@ -54,6 +55,13 @@ def test_a_forked_process_has_threads_of_its_own() -> None:
     assert os.waitpid(child, 0)[1] == 0
     assert os.read(reading, 10) == bytes([1, 2, 3])
     os.close(reading)
+
+
+def test_a_localizer_has_the_threads_that_it_is_told() -> None:
+    given = LocalizerOptions(neighbours=1)
+    told = given.with_threads(3)
+    assert told.pose.threads == 3
+    assert told == replace(given, pose=replace(given.pose, threads=3))  # and nothing else is changed
 
 
 def test_a_pose_does_not_depend_on_threads() -> None:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from semdb.localization.index.kernels import ByteArray, CodeArray, best_rows, cl
 from semdb.localization.index.reduction import Reduction
 from semdb.localization.index.vectors import Vectors
 from semdb.localization.ranking import best_first
+from semdb.localization.threads import each
 from semdb.types import BoolArray, Float32Array, FloatArray, Int64Array, IntArray
 
 SMALL = 20_000  # rows below which threads cost more than they save
@@ -151,7 +151,7 @@ class State:
             work(0, count)
             return
         bounds = np.linspace(0, count, self.threads + 1).astype(int).tolist()
-        list(_workers(self.threads).map(work, bounds[:-1], bounds[1:]))
+        each(lambda part: work(*part), list(pairwise(bounds)), self.threads)
 
 
 def order_of(ids: Int64Array, alive: BoolArray) -> Int64Array | None:
@@ -160,9 +160,3 @@ def order_of(ids: Int64Array, alive: BoolArray) -> Int64Array | None:
         return None
     rows = np.flatnonzero(alive)
     return rows[np.argsort(ids[rows], kind="stable")]
-
-
-@lru_cache(maxsize=4)
-def _workers(threads: int) -> ThreadPoolExecutor:
-    """The threads of all indexes of this process."""
-    return ThreadPoolExecutor(threads, "index")
