@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import DateTime
+from sqlalchemy import DateTime, Integer, literal
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.functions import FunctionElement
 
@@ -13,19 +13,18 @@ class now_plus(FunctionElement[Any]):  # noqa: N801 (an SQL function)
     """The time on the database, UTC, in `seconds` (whole, may be negative) from now."""
 
     type = DateTime()
-    inherit_cache = False  # the number is part of the statement's text
+    inherit_cache = True  # the number is a parameter: statements are compiled once
     name = "now_plus"
 
     def __init__(self, seconds: int = 0) -> None:
-        super().__init__()
-        self.seconds = int(seconds)
+        super().__init__(literal(int(seconds), Integer))
 
 
 @compiles(now_plus)
-def _server(element: Any, _compiler: Any, **_options: Any) -> str:
-    return f"TIMESTAMPADD(SECOND, {element.seconds}, UTC_TIMESTAMP())"
+def _server(element: Any, compiler: Any, **options: Any) -> str:
+    return f"TIMESTAMPADD(SECOND, {compiler.process(element.clauses, **options)}, UTC_TIMESTAMP())"
 
 
 @compiles(now_plus, "sqlite")
-def _sqlite(element: Any, _compiler: Any, **_options: Any) -> str:
-    return f"datetime('now', '{element.seconds:+d} seconds')"
+def _sqlite(element: Any, compiler: Any, **options: Any) -> str:
+    return f"datetime('now', {compiler.process(element.clauses, **options)} || ' seconds')"

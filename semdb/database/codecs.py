@@ -10,12 +10,12 @@ of uint32, and those of images with a side above 65535 still are. Keypoints may 
 from __future__ import annotations
 
 import struct
-import zlib
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from isal.isal_zlib import crc32
 
 from semdb.database.compact import compact, expand
 from semdb.errors import CodecError
@@ -51,7 +51,7 @@ def encode_array(array: npt.NDArray[Any], *, magic: bytes = ARRAY_MAGIC) -> byte
         raise CodecError(f"an array of {array.dtype} with {array.ndim} dimensions cannot be stored")
     body = struct.pack(f"<{array.ndim}I", *array.shape) + np.ascontiguousarray(array, dtype=dtype).tobytes()
     start = _HEADER.pack(magic, _SINCE.get(code, 1), code, array.ndim, 0, 0)[:_CHECKED]
-    return start + struct.pack("<I", zlib.crc32(body, zlib.crc32(start))) + body
+    return start + struct.pack("<I", crc32(body, crc32(start))) + body
 
 
 def decode_array(blob: bytes, where: str, *, magic: bytes = ARRAY_MAGIC) -> npt.NDArray[Any]:
@@ -73,7 +73,7 @@ def decode_array(blob: bytes, where: str, *, magic: bytes = ARRAY_MAGIC) -> npt.
         kind = "truncated" if len(blob) < expected else "too long"
         raise CodecError(f"{where}: the blob is {kind} ({len(blob)} bytes, shape {shape} needs {expected})")
     view = memoryview(blob)
-    if zlib.crc32(view[_HEADER.size :], zlib.crc32(view[:_CHECKED])) != checksum:
+    if crc32(view[_HEADER.size :], crc32(view[:_CHECKED])) != checksum:
         raise CodecError(f"{where}: the blob's checksum is wrong; delete the recording and ingest it again")
     return np.frombuffer(blob, dtype=dtype, offset=start).reshape(shape)
 
@@ -90,14 +90,12 @@ def decode_vectors(blobs: Sequence[bytes], where: str, keys: npt.NDArray[np.int6
         raise CodecError(f"{where} {keys[0]}: {first.dtype} {first.shape} is not a vector")
     start = _HEADER.size + 4
     head, tail, size = blobs[0][:_CHECKED], blobs[0][_HEADER.size : start], len(blobs[0])
-    seed = zlib.crc32(head)
+    seed = crc32(head)
     for key, blob in zip(keys, blobs, strict=True):
         if len(blob) != size or blob[:_CHECKED] != head or blob[_HEADER.size : start] != tail:
             other = decode_array(blob, f"{where} {key}")
             raise CodecError(f"{where} {key}: {other.dtype} {other.shape} is not a vector as others, {first.shape}")
-        if zlib.crc32(memoryview(blob)[_HEADER.size :], seed) != int.from_bytes(
-            blob[_CHECKED : _HEADER.size], "little"
-        ):
+        if crc32(memoryview(blob)[_HEADER.size :], seed) != int.from_bytes(blob[_CHECKED : _HEADER.size], "little"):
             decode_array(blob, f"{where} {key}")  # says what is wrong
     joined = np.frombuffer(b"".join(blobs), np.uint8).reshape(len(blobs), size)
     return np.ascontiguousarray(joined[:, start:]).view("<f4").astype(np.float32, copy=False)
@@ -107,29 +105,12 @@ def encode_mask(mask: BoolArray) -> bytes:
     """A mask ``[H, W]`` as run lengths."""
     if mask.ndim != 2:
         raise CodecError(f"a mask has two dimensions, not {mask.ndim}")
-    flat = np.ascontiguousarray(mask, dtype=np.bool_).ravel()
-    edges = np.flatnonzero(flat[1:] != flat[:-1]) + 1
-    bounds = np.concatenate([[0], edges, [flat.size]])
-    runs = np.diff(bounds)
-    if flat.size and flat[0]:
-        runs = np.concatenate([[0], runs])
+    from semdb.database._runs import run_lengths
+
     if max(mask.shape) > LONGEST_RUN:
+        runs = run_lengths(mask, max(1, mask.size))
         return encode_array(np.concatenate([mask.shape, runs]).astype("<u4"), magic=MASK_MAGIC)
-    return encode_array(np.concatenate([mask.shape, _short_runs(runs)]).astype("<u2"), magic=MASK_MAGIC)
-
-
-def _short_runs(runs: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """`runs` with those above `LONGEST_RUN` in pieces, between which are runs of 0 of the other kind."""
-    long = np.flatnonzero(runs > LONGEST_RUN)
-    if not len(long):
-        return runs
-    parts: list[npt.NDArray[np.int64]] = []
-    done = 0
-    for k in long.tolist():
-        pieces, rest = divmod(int(runs[k]), LONGEST_RUN)
-        parts += [runs[done:k], np.tile([LONGEST_RUN, 0], pieces), np.array([rest])]
-        done = k + 1
-    return np.concatenate([*parts, runs[done:]])
+    return encode_array(np.concatenate([mask.shape, run_lengths(mask, LONGEST_RUN)]).astype("<u2"), magic=MASK_MAGIC)
 
 
 def decode_mask(blob: bytes, where: str) -> BoolArray:

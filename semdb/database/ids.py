@@ -58,9 +58,11 @@ class SharedIds:
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
         self._known: dict[tuple[str, str], int] = {}
+        self._cameras: dict[Camera, int] = {}
 
     def forget(self) -> None:
         self._known = {}
+        self._cameras = {}
 
     def models(self, infos: Iterable[ModelInfo]) -> dict[ModelInfo, int]:
         wanted = {info: model_row(info) for info in infos}
@@ -72,8 +74,11 @@ class SharedIds:
         return self._ensure(categories, "name", [{"name": name} for name in wanted])
 
     def camera(self, camera: Camera) -> int:
-        row = camera_row(camera)
-        return self._ensure(cameras, "digest", [row])[row["digest"]]
+        known = self._cameras.get(camera)
+        if known is None:
+            row = camera_row(camera)
+            known = self._cameras[camera] = self._ensure(cameras, "digest", [row])[row["digest"]]
+        return known
 
     def _ensure(self, table: Table, key: str, rows: list[dict[str, Any]]) -> dict[str, int]:
         missing = [row for row in rows if (table.name, row[key]) not in self._known]

@@ -14,8 +14,23 @@ import secrets
 import socket
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
 
-from sqlalchemy import BindParameter, ColumnElement, Connection, Engine, and_, func, or_, select, update
+from sqlalchemy import (
+    BindParameter,
+    ColumnElement,
+    Connection,
+    Engine,
+    Select,
+    Update,
+    and_,
+    bindparam,
+    func,
+    or_,
+    select,
+    update,
+)
 
 from semdb.database import retry
 from semdb.database.clock import now_plus
@@ -69,32 +84,45 @@ def claim(
     lease_s: int = LEASE_S,
 ) -> list[Claim]:
     """Takes up to `limit` keyframes that nobody works on, of `frames` where given, by ascending index."""
-    wanted = _item.recording_id == recording_id
-    if frames is not None:
-        wanted = and_(wanted, _item.frame_index.in_(list(frames)))
-    expired = and_(_item.state == ItemState.RUNNING.value, _item.lease_until < now_plus())
-    free = or_(_item.state == ItemState.PENDING.value, and_(expired, _item.attempts < MOST_ATTEMPTS))
+    free, take, mine, worn_out = _claim_statements(lease_s, frames is not None)
+    wanted = {"of_recording": recording_id} | ({} if frames is None else {"of_frames": list(frames)})
 
     def work(connection: Connection) -> list[Claim]:
-        _give_up(connection, and_(wanted, expired, _item.attempts >= MOST_ATTEMPTS))
-        query = select(_item.frame_index).where(wanted, free).order_by(_item.frame_index).limit(limit)
-        indexes = list(connection.execute(query).scalars())
+        indexes = list(connection.execute(free, {**wanted, "most": limit}).scalars())
         if not indexes:
+            connection.execute(worn_out, wanted)
             return []
-        these = and_(_item.recording_id == recording_id, _item.frame_index.in_(indexes))
-        change = update(ingest_items).where(these, free)
-        values = {"state": ItemState.RUNNING.value, "worker": worker, "lease_until": now_plus(lease_s)}
-        connection.execute(change.values(**values, attempts=_item.attempts + 1))
-        mine = select(_item.frame_index, _item.attempts).where(these, _item.worker == worker)
-        mine = mine.where(_item.state == ItemState.RUNNING.value).order_by(_item.frame_index)
-        return [Claim(int(row.frame_index), int(row.attempts)) for row in connection.execute(mine)]
+        these = {"of_recording": recording_id, "of_frames": indexes, "of_worker": worker}
+        connection.execute(take, these)
+        return [Claim(int(row.frame_index), int(row.attempts)) for row in connection.execute(mine, these)]
 
     return retry.write(engine, work)
 
 
-def _give_up(connection: Connection, which: ColumnElement[bool]) -> None:
+@lru_cache(maxsize=16)
+def _claim_statements(lease_s: int, some: bool) -> tuple[Select[Any], Update, Select[Any], Update]:
+    """What finds free keyframes, takes them, reads what was taken, and gives up on the others; of `some` frames or all.
+
+    Built once: a worker claims often, and building them takes longer than running them.
+    """
+    wanted = _item.recording_id == bindparam("of_recording")
+    these = _item.frame_index.in_(bindparam("of_frames", expanding=True))
+    expired = and_(_item.state == ItemState.RUNNING.value, _item.lease_until < now_plus())
+    free = or_(_item.state == ItemState.PENDING.value, and_(expired, _item.attempts < MOST_ATTEMPTS))
+    among = and_(wanted, these) if some else wanted
+    taken = {"state": ItemState.RUNNING.value, "worker": bindparam("of_worker"), "lease_until": now_plus(lease_s)}
+    held = and_(_item.worker == bindparam("of_worker"), _item.state == ItemState.RUNNING.value)
+    return (
+        select(_item.frame_index).where(among, free).order_by(_item.frame_index).limit(bindparam("most")),
+        update(ingest_items).where(wanted, these, free).values(**taken, attempts=_item.attempts + 1),
+        select(_item.frame_index, _item.attempts).where(wanted, these, held).order_by(_item.frame_index),
+        _given_up(and_(among, expired, _item.attempts >= MOST_ATTEMPTS)),
+    )
+
+
+def _given_up(which: ColumnElement[bool]) -> Update:
     error = f"its worker died or was lost {MOST_ATTEMPTS} times while it was at this keyframe"
-    connection.execute(update(ingest_items).where(which).values(state=ItemState.FAILED.value, error=error, **_NOT_HELD))
+    return update(ingest_items).where(which).values(state=ItemState.FAILED.value, error=error, **_NOT_HELD)
 
 
 def held_by(recording_id: _Number, frame_index: _Number, token: _Number) -> ColumnElement[bool]:
@@ -134,7 +162,7 @@ def release_dead(engine: Engine, recording_id: int | None = None) -> int:
 
     def work(connection: Connection) -> int:
         theirs = and_(running, _item.worker.in_(gone))
-        _give_up(connection, and_(theirs, _item.attempts >= MOST_ATTEMPTS))
+        connection.execute(_given_up(and_(theirs, _item.attempts >= MOST_ATTEMPTS)))
         values = {"state": ItemState.PENDING.value, **_NOT_HELD}
         return connection.execute(update(ingest_items).where(theirs).values(**values)).rowcount
 
@@ -170,7 +198,7 @@ def lost(engine: Engine, recording_id: int | None = None, *, all_pending: bool =
     alive = recordings.c.state != RecordingState.DELETING.value
 
     def work(connection: Connection) -> list[QueuedItems]:
-        _give_up(connection, and_(expired, _item.attempts >= MOST_ATTEMPTS))
+        connection.execute(_given_up(and_(expired, _item.attempts >= MOST_ATTEMPTS)))
         connection.execute(update(ingest_items).where(expired).values(state=ItemState.PENDING.value, **_NOT_HELD))
         query = select(recordings.c.id, recordings.c.source, _item.frame_index)
         query = query.join(recordings, recordings.c.id == _item.recording_id).where(due, alive)

@@ -9,14 +9,16 @@ import numpy as np
 from semdb.compiled import kernel
 from semdb.types import BoolArray
 
+Window = tuple[int, int, int, int]  # left column, top row, width, height
 
-def bounding_box(mask: BoolArray) -> tuple[int, int, int, int]:
+
+def bounding_box(mask: BoolArray) -> Window:
     """Left column, top row, width and height of what is set in `mask` ``[H, W]``; zeros where nothing is.
 
     What OpenCV's ``boundingRect`` gives, in a fifth of its time.
     """
     height, width = mask.shape
-    box: tuple[int, int, int, int] = _bounds(np.ascontiguousarray(mask).reshape(-1).view(np.uint8), height, width)
+    box: Window = _bounds(np.ascontiguousarray(mask).reshape(-1).view(np.uint8), height, width)
     return box
 
 

@@ -10,7 +10,7 @@ from typing import TypeVar
 import cv2
 
 from semdb.errors import FrameError
-from semdb.perception.detections import DetectionRules, rules_of
+from semdb.perception.detections import DetectionRules, Region, rules_of
 from semdb.perception.detectors import load_detector
 from semdb.perception.encoders import load_encoder
 from semdb.perception.lifting import lift
@@ -121,11 +121,12 @@ class Describer:
     def _finish(
         self, view: View, found: tuple[Detection, ...], vector: Float32Array, timing_ms: dict[str, float]
     ) -> Description:
-        (detections, sightings), rules_ms = _timed(lambda: self._judge(found, view.image.shape[0]))
+        (regions, sightings), rules_ms = _timed(lambda: self._judge(found, view.image.shape[0]))
+        detections = tuple(region.detection for region in regions)
         grey = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY)
         features, extract_ms = _timed(lambda: self.features.extract(grey, self.rules.still(detections)))
         (keypoints, geometry), lift_ms = _timed(
-            lambda: _join(view.camera, view.depth, detections, features, self.rules.depth_gap)
+            lambda: _join(view.camera, view.depth, regions, features, self.rules.depth_gap)
         )
         return Description(
             camera=view.camera,
@@ -144,11 +145,11 @@ class Describer:
             grey=grey,
         )
 
-    def _judge(self, found: tuple[Detection, ...], height: int) -> tuple[tuple[Detection, ...], tuple[Sighting, ...]]:
+    def _judge(self, found: tuple[Detection, ...], height: int) -> tuple[tuple[Region, ...], tuple[Sighting, ...]]:
         """What is kept as objects, and all that was seen, of the classes that count."""
         counted = [d for d in found if self.rules.classes is None or d.category in self.rules.classes]
         sightings = tuple(d.sighting(height) for d in counted)
-        return self.rules.apply([d for d in found if not d.weak]), sightings
+        return self.rules.regions([d for d in found if not d.weak]), sightings
 
 
 def describer_from_specs(detector: str, encoder: str, features: str, settings: Settings) -> Describer:
@@ -174,13 +175,13 @@ def _images_at_once(detector: Detector, encoder: Encoder, wanted: int | None) ->
 def _join(
     camera: Camera,
     depth: Float32Array | None,
-    detections: tuple[Detection, ...],
+    regions: tuple[Region, ...],
     features: Features,
     depth_gap: float,
 ) -> tuple[Keypoints, tuple[ObjectGeometry, ...]]:
-    owner = assign_to_objects(features.xy, [detection.mask for detection in detections])
-    ordered, object_index = sort_by_object(features, owner)
-    geometry = tuple(object_geometry(camera, depth, detection, depth_gap) for detection in detections)
+    masks, areas = [region.detection.mask for region in regions], [region.area for region in regions]
+    ordered, object_index = sort_by_object(features, assign_to_objects(features.xy, masks, areas))
+    geometry = tuple(object_geometry(camera, depth, r.detection, depth_gap, r.window) for r in regions)
     return Keypoints(ordered, object_index, lift(camera, depth, ordered.xy)), geometry
 
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from semdb.errors import UsageError
-from semdb.perception._masks import bounding_box
+from semdb.perception._masks import Window, bounding_box
 from semdb.perception.detectors.coco import INDOOR, NO_OBJECT
 from semdb.perception.model_files import canonical_json
 from semdb.perception.protocols import Detector
@@ -58,9 +58,13 @@ class DetectionRules:
 
     def apply(self, detections: Sequence[Detection]) -> tuple[Detection, ...]:
         """The objects of a detector's `detections`, by descending score."""
+        return tuple(region.detection for region in self.regions(detections))
+
+    def regions(self, detections: Sequence[Detection]) -> tuple[Region, ...]:
+        """What `apply` gives, and where in the image it is."""
         kept = [d for d in detections if self.classes is None or d.category in (*self.classes, *self.dynamic)]
         if self.masks is None:
-            return tuple(kept)
+            return tuple(region_of(d) for d in kept)
         cleaned = [c for c in (clean_mask(d, self.masks) for d in kept) if c is not None]
         return without_duplicates(cleaned, self.masks)
 
@@ -90,7 +94,22 @@ class DetectionRules:
         return replace(detector, config=canonical_json(config))
 
 
-def clean_mask(detection: Detection, rules: MaskRules) -> Detection | None:
+@dataclass(frozen=True, slots=True, eq=False)
+class Region:
+    """A detection, how many pixels its mask has, and the window about them: left column, top row, width, height."""
+
+    detection: Detection
+    area: int
+    window: Window
+
+
+def region_of(detection: Detection) -> Region:
+    """The region of a detection as it is."""
+    x, y, w, h = bounding_box(detection.mask)
+    return Region(detection, int(np.count_nonzero(detection.mask[y : y + h, x : x + w])), (x, y, w, h))
+
+
+def clean_mask(detection: Detection, rules: MaskRules) -> Region | None:
     """`detection` with the main part of its mask and the box about that; None when too little is left.
 
     A box changes only where its mask lost parts.
@@ -99,49 +118,30 @@ def clean_mask(detection: Detection, rules: MaskRules) -> Detection | None:
     inside = np.ascontiguousarray(detection.mask[y : y + h, x : x + w])
     before = int(np.count_nonzero(inside))
     part = _main_parts(inside, rules.part_share)
-    area = int(np.count_nonzero(part))
+    area = before if part is inside else int(np.count_nonzero(part))
     if area < rules.min_pixels:
         return None
     if area == before:
-        return detection
+        return Region(detection, area, (x, y, w, h))
     mask = np.zeros_like(detection.mask)
     mask[y : y + h, x : x + w] = part
     px, py, pw, ph = bounding_box(part)
     limits = np.array([x + px, y + py, x + px + pw - 1, y + py + ph - 1], dtype=np.float32)
     old = detection.box
     box = np.concatenate([np.maximum(old[:2], limits[:2]), np.minimum(old[2:], limits[2:])]).astype(np.float32)
-    return replace(detection, mask=mask, box=box)
+    return Region(replace(detection, mask=mask, box=box), area, (x + px, y + py, pw, ph))
 
 
-def without_duplicates(detections: Sequence[Detection], rules: MaskRules) -> tuple[Detection, ...]:
-    """`detections` by descending score, each object once (`MaskRules` says what is a duplicate); scores stay."""
-    kept: list[_Region] = []
-    for candidate in sorted(detections, key=lambda detection: -detection.score):
-        region = _region(candidate)
-        if not any(_is_duplicate(region, other, rules) for other in kept):
-            kept.append(region)
-    return tuple(region.detection for region in kept)
+def without_duplicates(regions: Sequence[Region], rules: MaskRules) -> tuple[Region, ...]:
+    """`regions` by descending score, each object once (`MaskRules` says what is a duplicate); scores stay."""
+    kept: list[Region] = []
+    for candidate in sorted(regions, key=lambda region: -region.detection.score):
+        if not any(_is_duplicate(candidate, other, rules) for other in kept):
+            kept.append(candidate)
+    return tuple(kept)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Region:
-    """A detection, how many pixels its mask has, and the window that they lie in, its end not included."""
-
-    detection: Detection
-    area: int
-    left: int
-    top: int
-    right: int
-    bottom: int
-
-
-def _region(detection: Detection) -> _Region:
-    x, y, w, h = bounding_box(detection.mask)
-    area = int(np.count_nonzero(detection.mask[y : y + h, x : x + w]))
-    return _Region(detection, area, x, y, x + w, y + h)
-
-
-def _is_duplicate(candidate: _Region, other: _Region, rules: MaskRules) -> bool:
+def _is_duplicate(candidate: Region, other: Region, rules: MaskRules) -> bool:
     """Whether `candidate` is a second detection of what `other` is, which has at least its score."""
     common = _common_pixels(candidate, other)
     if common == 0:
@@ -152,9 +152,10 @@ def _is_duplicate(candidate: _Region, other: _Region, rules: MaskRules) -> bool:
     return same_class and common >= rules.contained * candidate.area
 
 
-def _common_pixels(a: _Region, b: _Region) -> int:
-    left, right = max(a.left, b.left), min(a.right, b.right)
-    top, bottom = max(a.top, b.top), min(a.bottom, b.bottom)
+def _common_pixels(a: Region, b: Region) -> int:
+    (ax, ay, aw, ah), (bx, by, bw, bh) = a.window, b.window
+    left, right = max(ax, bx), min(ax + aw, bx + bw)
+    top, bottom = max(ay, by), min(ay + ah, by + bh)
     if left >= right or top >= bottom:
         return 0
     window = np.s_[top:bottom, left:right]

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from semdb.geometry import back_project
 from semdb.perception._depth import count_labels, mark_known, of_label, smooth_surface, within
-from semdb.perception._masks import bounding_box
+from semdb.perception._masks import Window, bounding_box
 from semdb.types import BoolArray, Camera, Detection, Features, Float32Array, FloatArray, IntArray, ObjectGeometry
 
 _MAX_POINTS = 1000  # per object: percentiles of more are no better and cost time
@@ -22,10 +22,11 @@ _MIN_POINTS = 10
 _JUMP = 1.0513  # exp(0.05): a neighbour nearer or farther by this factor is another surface
 
 
-def assign_to_objects(xy: Float32Array, masks: Sequence[BoolArray]) -> IntArray:
+def assign_to_objects(xy: Float32Array, masks: Sequence[BoolArray], areas: Sequence[int] | None = None) -> IntArray:
     """The ordinal of the mask that each pixel position `xy` ``[n, 2]`` lies in, -1 in none, int32 ``[n]``.
 
-    Where masks overlap the smallest wins (a cup on a table belongs to the cup), of equal ones the first.
+    Where masks overlap the smallest wins (a cup on a table belongs to the cup), of equal ones the first; `areas` are
+    their numbers of pixels, where known.
     Positions are rounded to the nearest pixel and clipped to the image.
     """
     owner = np.full(len(xy), -1, dtype=np.int32)
@@ -35,7 +36,8 @@ def assign_to_objects(xy: Float32Array, masks: Sequence[BoolArray]) -> IntArray:
     u = np.clip(np.rint(xy[:, 0]), 0, width - 1).astype(np.intp)
     v = np.clip(np.rint(xy[:, 1]), 0, height - 1).astype(np.intp)
     pixels = v * width + u
-    areas = [int(np.count_nonzero(mask)) for mask in masks]
+    if areas is None:
+        areas = [int(np.count_nonzero(mask)) for mask in masks]
     for ordinal in sorted(range(len(masks)), key=lambda k: (-areas[k], -k)):
         owner[masks[ordinal].take(pixels)] = ordinal
     return owner
@@ -61,15 +63,19 @@ def take_features(features: Features, rows: npt.NDArray[np.intp]) -> Features:
 
 
 def object_geometry(
-    camera: Camera, depth: Float32Array | None, detection: Detection, depth_gap: float = 0.0
+    camera: Camera,
+    depth: Float32Array | None,
+    detection: Detection,
+    depth_gap: float = 0.0,
+    window: Window | None = None,
 ) -> ObjectGeometry:
     """Where the object of `detection` is, from `depth` ``[H, W]`` metres under its mask less the mask's rim.
 
     The centroid is the median of the points and the extent goes from their 5th to their 95th percentile, so a
     mask that takes in some background does little harm; with a `depth_gap` the background goes first
-    (`at_one_depth`). NaN with fewer than 10 points with depth.
+    (`at_one_depth`). NaN with fewer than 10 points with depth. `window` is about the mask's pixels, where known.
     """
-    x, y, w, h = bounding_box(detection.mask)
+    x, y, w, h = bounding_box(detection.mask) if window is None else window
     inside = np.ascontiguousarray(detection.mask[y : y + h, x : x + w])
     area = int(np.count_nonzero(inside))
     nowhere = ObjectGeometry(area, np.full(3, np.nan), np.full(3, np.nan))

@@ -4,12 +4,13 @@ OpenCV decodes a truncated PNG or JPEG in part and says nothing, so the structur
 PNG chunks with their checksums up to IEND, JPEG markers up to EOI.
 """
 
+# compiled functions take what numba infers
+# mypy: disable-error-code="no-untyped-call"
 from __future__ import annotations
 
 import os
 import re
 import struct
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -19,18 +20,16 @@ import numpy as np
 import numpy.typing as npt
 
 from semdb.errors import FrameError
+from semdb.recordings import png
+from semdb.recordings.png import TRUNCATED, ImageFileError
 from semdb.types import Float32Array, ImageArray
 
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-PNG_END = b"\x00\x00\x00\x00IEND\xaeB`\x82"
-PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}
 JPEG_START = b"\xff\xd8\xff"
 JPEG_END = b"\xff\xd9"
 JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 # In entropy-coded data a marker is 0xFF followed by anything but a stuffed zero, a restart or another fill byte.
 JPEG_MARKER_IN_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 TAIL = 4096
-TRUNCATED = "the file ends too early (truncated); copy or record it again"
 NOT_AN_IMAGE = "is not a PNG or JPEG image"
 
 
@@ -50,10 +49,6 @@ class ImageHeader:
         return self.width, self.height
 
 
-class _ImageError(ValueError):
-    """Why a file is no whole image; without the file's name."""
-
-
 def inspect_file(path: Path) -> ImageHeader:
     """Header of a PNG or JPEG file, and a cheap check that its end is there; nothing is decoded.
 
@@ -61,48 +56,43 @@ def inspect_file(path: Path) -> ImageHeader:
     """
     try:
         with path.open("rb") as file:
-            start = file.read(33)
+            start = file.read(png.HEADER_BYTES)
             if not start:
-                raise _ImageError("the file is empty")
-            if start.startswith(PNG_SIGNATURE):
-                header = _png_header(start)
+                raise ImageFileError("the file is empty")
+            if start.startswith(png.SIGNATURE):
+                header = _header_of(png.read_header(start))
                 _check_png_end(file)
             elif start.startswith(JPEG_START):
                 header = _jpeg_header(file)
                 _check_jpeg_end(file)
             else:
-                raise _ImageError(NOT_AN_IMAGE)
+                raise ImageFileError(NOT_AN_IMAGE)
     except FileNotFoundError as error:
         raise FrameError("the file is missing") from error
     except OSError as error:
         raise FrameError(f"the file cannot be read: {error.strerror}") from error
-    except _ImageError as error:
+    except ImageFileError as error:
         raise FrameError(str(error)) from error
     return header
 
 
-def _png_header(start: bytes) -> ImageHeader:
-    if len(start) < 33:
-        raise _ImageError(TRUNCATED)
-    length, kind, width, height, bits, colour = struct.unpack(">I4sIIBB", start[8:26])
-    if kind != b"IHDR" or length != 13 or colour not in PNG_CHANNELS or not width or not height:
-        raise _ImageError("has a broken PNG header")
-    return ImageHeader("png", width, height, bits, PNG_CHANNELS[colour])
+def _header_of(header: png.PngHeader) -> ImageHeader:
+    return ImageHeader("png", header.width, header.height, header.bits, header.channels)
 
 
 def _check_png_end(file: BinaryIO) -> None:
     size = file.seek(0, os.SEEK_END)
-    file.seek(max(0, size - len(PNG_END)))
-    if file.read() == PNG_END:
+    file.seek(max(0, size - len(png.END)))
+    if file.read() == png.END:
         return
-    position = len(PNG_SIGNATURE)  # bytes may follow IEND: walk the chunks before calling it truncated
+    position = len(png.SIGNATURE)  # bytes may follow IEND: walk the chunks before calling it truncated
     while position + 12 <= size:
         file.seek(position)
         length, kind = struct.unpack(">I4s", file.read(8))
         position += length + 12
         if kind == b"IEND" and position <= size:
             return
-    raise _ImageError(TRUNCATED)
+    raise ImageFileError(TRUNCATED)
 
 
 def _jpeg_header(file: BinaryIO) -> ImageHeader:
@@ -112,17 +102,17 @@ def _jpeg_header(file: BinaryIO) -> ImageHeader:
         while len(marker) == 2 and marker == b"\xff\xff":
             marker = marker[1:] + file.read(1)
         if len(marker) < 2:
-            raise _ImageError(TRUNCATED)
+            raise ImageFileError(TRUNCATED)
         if marker[0] != 0xFF or marker[1] == 0xDA:
-            raise _ImageError("has a broken JPEG header")
+            raise ImageFileError("has a broken JPEG header")
         body = file.read(2)
         if len(body) < 2:
-            raise _ImageError(TRUNCATED)
+            raise ImageFileError(TRUNCATED)
         length = int.from_bytes(body, "big")
         if marker[1] in JPEG_FRAMES:
             frame = file.read(6)
             if len(frame) < 6:
-                raise _ImageError(TRUNCATED)
+                raise ImageFileError(TRUNCATED)
             bits, height, width, channels = struct.unpack(">BHHB", frame)
             return ImageHeader("jpeg", width, height, bits, channels)
         file.seek(length - 2, os.SEEK_CUR)
@@ -132,24 +122,7 @@ def _check_jpeg_end(file: BinaryIO) -> None:
     size = file.seek(0, os.SEEK_END)
     file.seek(max(0, size - TAIL))
     if JPEG_END not in file.read():
-        raise _ImageError(TRUNCATED)
-
-
-def _check_png_bytes(data: bytes) -> None:
-    """Walks all chunks with their checksums; libpng would print, and give back what it has."""
-    view = memoryview(data)
-    position = len(PNG_SIGNATURE)
-    while position + 12 <= len(data):
-        length, kind = struct.unpack_from(">I4s", data, position)
-        end = position + 8 + length
-        if end + 4 > len(data):
-            break
-        if zlib.crc32(view[position + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
-            raise _ImageError(f"is damaged: wrong checksum of PNG chunk at byte {position}")
-        if kind == b"IEND":
-            return
-        position = end + 4
-    raise _ImageError(TRUNCATED)
+        raise ImageFileError(TRUNCATED)
 
 
 def _check_jpeg_bytes(data: bytes) -> None:
@@ -157,13 +130,13 @@ def _check_jpeg_bytes(data: bytes) -> None:
     position, scans = 2, 0
     while position + 2 <= len(data):
         if data[position] != 0xFF:
-            raise _ImageError(f"is damaged: no JPEG marker at byte {position}")
+            raise ImageFileError(f"is damaged: no JPEG marker at byte {position}")
         marker = data[position + 1]
         if marker == 0xFF:
             position += 1
         elif marker == 0xD9:
             if scans == 0:
-                raise _ImageError("is damaged: a JPEG without image data")
+                raise ImageFileError("is damaged: a JPEG without image data")
             return
         else:
             position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
@@ -171,23 +144,26 @@ def _check_jpeg_bytes(data: bytes) -> None:
                 scans += 1
                 found = JPEG_MARKER_IN_SCAN.search(data, position)
                 position = found.start() if found else len(data)
-    raise _ImageError(TRUNCATED)
+    raise ImageFileError(TRUNCATED)
 
 
 def _decode(data: bytes, flags: int) -> npt.NDArray[Any]:
+    """Pixels as OpenCV gives them with `flags`, but three channels of 8 bits are always RGB. Raises ImageFileError."""
     if not data:
-        raise _ImageError("the file is empty")
-    if data.startswith(PNG_SIGNATURE):
-        _png_header(data[:33])
-        _check_png_bytes(data)
+        raise ImageFileError("the file is empty")
+    if data.startswith(png.SIGNATURE):
+        # all chunks are checked first: libpng would print, and give back what it has
+        pixels = png.decode(png.read_header(data[: png.HEADER_BYTES]), list(png.chunks(data)))
+        if pixels is not None and (pixels.ndim == 3 or flags == cv2.IMREAD_UNCHANGED):
+            return pixels
     elif data.startswith(JPEG_START):
         _check_jpeg_bytes(data)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
-        raise _ImageError(f"cannot be decoded: {error.err}") from error
+        raise ImageFileError(f"cannot be decoded: {error.err}") from error
     if image is None:
-        raise _ImageError("is not an image that can be decoded (PNG and JPEG can)")
+        raise ImageFileError("is not an image that can be decoded (PNG and JPEG can)")
     return np.asarray(image)
 
 
@@ -200,7 +176,7 @@ def decode_color(data: bytes, name: str) -> ImageArray:
     """
     try:
         rgb = _decode(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
-    except _ImageError as error:
+    except ImageFileError as error:
         raise FrameError(f"{name}: {error}") from error
     return np.asarray(rgb, dtype=np.uint8)
 
@@ -212,7 +188,7 @@ def decode_16bit(data: bytes, name: str, size: tuple[int, int], what: str = "a d
     """
     try:
         image = _decode(data, cv2.IMREAD_UNCHANGED)
-    except _ImageError as error:
+    except ImageFileError as error:
         raise FrameError(f"{name}: {error}") from error
     if image.dtype != np.uint16 or image.ndim != 2:
         channels = 1 if image.ndim == 2 else image.shape[2]
@@ -232,10 +208,11 @@ def decode_depth(data: bytes, name: str, depth_scale: float, size: tuple[int, in
     `depth_scale` is units per metre, `size` the expected (width, height), `name` for messages. The values 0 (no
     measurement) and 65535 (7-Scenes' mark, and saturation everywhere) are invalid. Raises FrameError.
     """
+    from semdb.recordings._png_rows import scaled
+
     raw = decode_16bit(data, name, size)
-    depth = raw.astype(np.float32)
-    depth *= np.float32(1.0 / depth_scale)
-    depth[(raw == 0) | (raw == 65535)] = np.nan
+    depth = np.empty(raw.shape, np.float32)
+    scaled(raw, np.float32(1.0 / depth_scale), depth)
     return depth
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -41,6 +41,7 @@ def test_arrays_come_back(array: npt.NDArray[Any]) -> None:
     assert (decoded.dtype, decoded.shape) == (array.dtype, array.shape)
 
 
+@settings(deadline=None)  # kernels compile at their first call
 @given(hnp.arrays(np.bool_, st.tuples(st.integers(0, 20), st.integers(0, 20))))
 def test_masks_come_back(mask: npt.NDArray[np.bool_]) -> None:
     decoded = decode_mask(encode_mask(mask), "here")
