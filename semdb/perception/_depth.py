@@ -23,6 +23,7 @@ def fit_inverse_depth(  # type: ignore[no-untyped-def]  # pragma: no cover
     """
     height, width = depth.shape
     limit = np.float32(np.inf)
+    flat = depth.reshape(height * width)
     values = np.empty((2 * half + 1) ** 2, np.float64)
     across, down = np.empty_like(values), np.empty_like(values)
     for k in range(len(xy)):
@@ -30,32 +31,37 @@ def fit_inverse_depth(  # type: ignore[no-untyped-def]  # pragma: no cover
             continue
         px, py = np.float64(xy[k, 0]), np.float64(xy[k, 1])
         u0, v0 = int(np.rint(px)), int(np.rint(py))
-        n = 0
+        left, right = max(u0 - half, 0), min(u0 + half + 1, width)
+        n = np.uintp(0)
         sx = sy = sxx = sxy = syy = t = tx = ty = 0.0
         for v in range(max(v0 - half, 0), min(v0 + half + 1, height)):
-            for u in range(max(u0 - half, 0), min(u0 + half + 1, width)):
-                z = depth[v, u]
+            dy = v - py
+            for u in range(left, right):
+                z = flat[np.uintp(v * width + u)]
                 if not (z > 0 and z < limit):
                     continue
-                w, dx, dy = np.float64(np.float32(1) / z), u - px, v - py
+                w, dx = np.float64(np.float32(1) / z), u - px
                 values[n], across[n], down[n] = w, dx, dy
-                n += 1
+                n = np.uintp(n + np.uintp(1))
                 sx, sy, t = sx + dx, sy + dy, t + w
                 sxx, sxy, syy = sxx + dx * dx, sxy + dx * dy, syy + dy * dy
                 tx, ty = tx + dx * w, ty + dy * w
         if n < needed:
             continue
         # Known pixels in two lines leave a slope nearly open: a little weight on zero slope keeps it finite.
-        s = n + 1e-9
+        s = np.float64(n) + 1e-9
         sxx, syy = sxx + 1e-9 - sx * sx / s, syy + 1e-9 - sy * sy / s
         sxy, tx, ty = sxy - sx * sy / s, tx - sx * t / s, ty - sy * t / s
         c = (ty - sxy / sxx * tx) / (syy - sxy / sxx * sxy)
         b = (tx - sxy * c) / sxx
         a = (t - sx * b - sy * c) / s
-        worst = 0.0
-        for i in range(n):
-            worst = max(worst, abs(values[i] - (a + b * across[i] + c * down[i])))
-        if a > 0 and worst <= residual_limit + residual_share * a and np.hypot(b * fx, c * fy) <= slope_limit * a:
+        if not a > 0:
+            continue
+        bound, beyond = residual_limit + residual_share * a, 0
+        for j in range(n):
+            i = np.uintp(j)
+            beyond += not abs(values[i] - (a + b * across[i] + c * down[i])) <= bound
+        if beyond == 0 and np.hypot(b * fx, c * fy) <= slope_limit * a:
             out[k] = a
 
 
@@ -66,35 +72,33 @@ def smooth_surface(mask, depth, top, left, step, smooth):  # type: ignore[no-unt
     Writes 0 or 1 to `smooth` uint8 ``[h, w]``. Returns how many pixels are known.
     """
     rows, columns = mask.shape
-    right, below = left + columns, top + rows
+    here, under = np.zeros(columns + 1, np.float32), np.zeros(columns + 1, np.float32)  # 0: not known
     known = 0
-    for row in range(rows):
-        here = depth[top + row, left:right]
-        under = depth[min(top + row + 1, below - 1), left:right]
-        line, next_line, out = mask[row], mask[min(row + 1, rows - 1)], smooth[row]
-        found = 0
-        for column in range(columns - 1):  # without branches: several pixels at a time
-            inside = line[column] & _known(here[column])
-            across = line[column + 1] & _known(here[column + 1]) & _jump(here[column], here[column + 1], step)
-            down = next_line[column] & _known(under[column]) & _jump(here[column], under[column], step)
-            found += inside
-            out[column] = inside & ~across & ~down
-        last = columns - 1
-        inside = line[last] & _known(here[last])
-        down = next_line[last] & _known(under[last]) & _jump(here[last], under[last], step)
-        out[last] = inside & ~down
-        known += found + inside
+    for row in range(rows + 1):
+        here, under = under, here
+        if row < rows:
+            line, values = mask[row], depth[top + row, left : left + columns]
+            for k in range(columns):
+                x = np.uintp(k)
+                under[x] = values[x] if line[x] & _known(values[x]) else np.float32(0)
+        else:
+            under[:] = 0
+        if row == 0:
+            continue
+        out, found = smooth[row - 1], np.int32(0)
+        for k in range(columns):  # without branches: several pixels at a time
+            x = np.uintp(k)
+            z, right, below = here[x], here[x + np.uintp(1)], under[x]
+            nearest = min(right if right > 0 else z, below if below > 0 else z)
+            out[x] = np.uint8((z > 0) & (max(right, below) <= z * step) & (z <= nearest * step))
+            found = np.int32(found + np.int32(z > 0))
+        known += found
     return known
 
 
 @kernel(inline="always")
 def _known(z):  # type: ignore[no-untyped-def]  # pragma: no cover
     return (z > 0) & (z < np.float32(np.inf))
-
-
-@kernel(inline="always")
-def _jump(z, other, step):  # type: ignore[no-untyped-def]  # pragma: no cover
-    return (other > z * step) | (z > other * step)
 
 
 @kernel

@@ -322,3 +322,17 @@ def describe(grey: Any, step: int, margin: int, top: int, rows: int, left: int, 
         else:
             _collect(means, weights, fields, descriptors[k])
         _normalise(descriptors[k])
+
+
+@kernel
+def describe_levels(sums: Any, pitch: int, pad: int, parts: Any, edges: Any, bounds: Any, order: Any, grey: Any,
+                    candidates: Any, angles: Any, extended: bool, weights: Any, descriptors: Any) -> None:  # fmt: skip
+    """Descriptors of the candidates `order[bounds[k] : bounds[k + 1]]` from level k, for all k of the `level_parts`."""
+    for k in range(len(parts)):
+        step, half, margin = parts[k, 0], parts[k, 1], parts[k, 2]
+        top, rows, left, across = parts[k, 3], parts[k, 4], parts[k, 5], parts[k, 6]
+        smooth(sums, pitch, pad, step, half, edges[k], margin, top, rows, left, across, grey)
+        describe(
+            grey, step, margin, top, parts[k, 7], left, parts[k, 8], across, candidates, angles,
+            order[bounds[k] : bounds[k + 1]], extended, weights, descriptors,
+        )  # fmt: skip

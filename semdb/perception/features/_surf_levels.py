@@ -38,17 +38,6 @@ class Level:
         """Pixels around the image that the box may touch."""
         return self.margin + self.half + 2 + self.step
 
-    def samples(self, pixels: int) -> int:
-        """Samples along a side of the image of so many pixels."""
-        return -(-(pixels - 1 + 2 * self.margin) // self.step) + 1
-
-    def window(self, low: float, high: float, reach: float, samples: int) -> tuple[int, int]:
-        """First and last (not included) of the `samples` along a side within `reach` of the pixels `low` to `high`."""
-        first = int((low + self.margin - reach) // self.step)
-        last = int((high + self.margin + reach) // self.step) + 2
-        first = min(max(first, 0), samples - 2)
-        return first, max(min(last, samples), first + 2)
-
 
 def level_keys(sizes: Float32Array) -> npt.NDArray[np.int64]:
     """Key of the level that serves keypoints of `sizes` [n]; depends on nothing but the size."""
@@ -70,3 +59,32 @@ def level_of(key: int, smoothing: float) -> Level:
     inner = half * (half + 1) * (2 * half + 1) / 3  # sum of squared offsets
     edge = (variance * (2 * half + 1) - inner) / (2 * ((half + 1) ** 2 - variance))
     return Level(step, half, edge)
+
+
+# Columns of `level_parts`.
+STEP, HALF, MARGIN, TOP, ROWS, LEFT, ACROSS, ALL_ROWS, ALL_COLUMNS = range(9)
+
+
+def level_parts(
+    keys: npt.NDArray[np.int64], low: Float32Array, high: Float32Array, size: tuple[int, int], smoothing: float
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+    """Of the level of each of `keys` [n] the part that its keypoints read: numbers [n, 9] as named above, edges [n].
+
+    `low` and `high` [n, 3] are the least and the greatest x, y and size of keypoints; `size` is the image's height and
+    width in pixels. A part begins at the sample TOP, LEFT of a level with ALL_ROWS times ALL_COLUMNS samples.
+    """
+    levels = [level_of(key, smoothing) for key in keys.tolist()]
+    parts = np.empty((len(keys), 9), np.int64)
+    parts[:, STEP : MARGIN + 1] = [(level.step, level.half, level.margin) for level in levels]
+    step, margin = parts[:, STEP], parts[:, MARGIN]
+    least, most = low.astype(np.float64), high.astype(np.float64)
+    reach = 15 * CELL * most[:, 2] + 2 * step  # of a window turned by 45 degrees
+    for axis, pixels, begin in ((1, size[0], TOP), (0, size[1], LEFT)):
+        samples = -(-(pixels - 1 + 2 * margin) // step) + 1
+        first = ((least[:, axis] + margin - reach) // step).astype(np.int64)
+        last = ((most[:, axis] + margin + reach) // step).astype(np.int64) + 2
+        first = np.minimum(np.maximum(first, 0), samples - 2)
+        parts[:, begin] = first
+        parts[:, begin + 1] = np.maximum(np.minimum(last, samples), first + 2) - first
+        parts[:, ALL_ROWS if axis else ALL_COLUMNS] = samples
+    return parts, np.array([level.edge for level in levels])

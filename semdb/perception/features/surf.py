@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semdb.errors import UsageError
-from semdb.perception.features._surf_levels import CELL, Level, level_keys, level_of
+from semdb.perception.features._surf_levels import ACROSS, ROWS, Level, level_keys, level_of, level_parts
 from semdb.types import BoolArray, Features, Float32Array, ImageArray, IntArray
 
 UPRIGHT_ANGLE = 270.0  # what OpenCV gives upright keypoints
@@ -247,37 +247,35 @@ class SURF:
     def _descriptor_tasks(
         self, plane: _Plane, candidates: Float32Array, angles: Float32Array, descriptors: Float32Array
     ) -> list[Callable[[], None]]:
-        """One task per level of smoothing: make its image, describe the keypoints of its sizes from it."""
-        from semdb.perception.features._surf_describe import describe, descriptor_weights, smooth
+        """Tasks that, level of smoothing by level, make its image and describe the keypoints of its sizes from it.
+
+        One thread has one task, since a call costs as much as a small level.
+        """
+        from semdb.perception.features._surf_describe import describe_levels, descriptor_weights
 
         flat, pitch = plane.sums.reshape(-1), plane.sums.shape[1]
         weights = descriptor_weights(self.window_sigma)
-
-        def run(key: int, chosen: npt.NDArray[np.intp], low: list[float], high: list[float]) -> None:
-            level = self._level(key)
-            rows, columns = level.samples(plane.height), level.samples(plane.width)
-            reach = 15 * CELL * high[2] + 2 * level.step  # of a window turned by 45 degrees
-            left, right = level.window(low[0], high[0], reach, columns)
-            top, bottom = level.window(low[1], high[1], reach, rows)
-            across = right - left
-            grey = self._scratch.array("grey", ((bottom - top) * across,), np.float32)
-            smooth(
-                flat, pitch, plane.pad, level.step, level.half, level.edge, level.margin,
-                top, bottom - top, left, across, grey,
-            )  # fmt: skip
-            describe(
-                grey, level.step, level.margin, top, rows, left, columns, across, candidates, angles,
-                chosen, self.extended, weights, descriptors,
-            )  # fmt: skip
-
-        keys = np.where(angles >= 0, level_keys(candidates[:, 2]), -1)
+        oriented = np.flatnonzero(angles >= 0)
+        if not len(oriented):
+            return []
+        keys = level_keys(candidates[oriented, 2])
         order = np.argsort(keys, kind="stable")
         starts = np.flatnonzero(np.diff(keys[order], prepend=-2))
-        extents = candidates[order, :3]  # x, y, size: of all levels at once, since calls cost more than their work
-        low = np.minimum.reduceat(extents, starts, axis=0).tolist()
-        high = np.maximum.reduceat(extents, starts, axis=0).tolist()
-        groups = zip(keys[order[starts]].tolist(), np.split(order, starts[1:]), low, high, strict=True)
-        return [partial(run, *group) for group in groups if group[0] >= 0]
+        bounds, keys = np.append(starts, len(order)), keys[order[starts]]
+        order = oriented[order]
+        extents = candidates[order, :3]  # x, y, size
+        low, high = np.minimum.reduceat(extents, starts), np.maximum.reduceat(extents, starts)
+        parts, edges = level_parts(keys, low, high, (plane.height, plane.width), self.smoothing)
+        samples = parts[:, ROWS] * parts[:, ACROSS]
+
+        def run(first: int, last: int) -> None:
+            grey = self._scratch.array("grey", (int(samples[first:last].max()),), np.float32)
+            describe_levels(
+                flat, pitch, plane.pad, parts[first:last], edges[first:last], bounds[first : last + 1], order, grey,
+                candidates, angles, self.extended, weights, descriptors,
+            )  # fmt: skip
+
+        return [partial(run, a, b) for a, b in _shares(len(keys), 1 if self.threads == 1 else len(keys))]
 
     def _run(self, tasks: Sequence[Callable[[], Any]]) -> list[Any]:
         if self.threads == 1 or len(tasks) < 2:
