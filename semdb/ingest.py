@@ -172,8 +172,11 @@ def ingest_recording(
             done += 1
             if progress is not None:
                 progress(f"ingesting {recording.name}", min(done, todo), todo)
-        if not any(items.left(store.engine, summary.recording_id)):
+        left = sum(items.left(store.engine, summary.recording_id))
+        if not left:
             break
+        if progress is not None and todo:
+            progress(f"waiting for other processes at {recording.name}", max(0, todo - left), todo)
         time.sleep(SECONDS_BETWEEN_LOOKS)  # others are still at theirs, or have died: then their leases run out
     store.finish_recording(summary.recording_id)
     summary.failed = {item.frame_index: item.error for item in store.failed_items(summary.recording_id)}

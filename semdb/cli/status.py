@@ -50,7 +50,7 @@ def command(
                 if watch:
                     show_rates(recordings, rates)
                 show_workers(store, settings, everybody=watch)
-            if not watch or all(recording.state == "complete" for recording in recordings):
+            if not watch or all(recording.state in ("complete", "deleting") for recording in recordings):
                 return
             time.sleep(SECONDS_BETWEEN_LOOKS)
 
@@ -205,8 +205,19 @@ def retry(overrides: Overrides, map_name: MapName = None) -> None:
             number = requeue_failed(store.engine, recording.recording_id)
             total += number
             if number:
-                print(f"{recording.map}/{recording.name}: {number} put back; run: semdb ingest {recording.source}")
+                print(f"{recording.map}/{recording.name}: {number} put back; run: {ingest_again(recording)}")
     if total:
         print("or, where workers do it: semdb ingest --resume")
     else:
         print("nothing has failed")
+
+
+def ingest_again(recording: RecordingStatus) -> str:
+    """The command that goes on with a recording: under its own name, in its own map, with its own camera."""
+    import shlex
+
+    from semdb.recordings.source import split_source
+
+    where, camera = split_source(recording.source)
+    words = ["semdb", "ingest", where, "--map", recording.map, "--name", recording.name]
+    return shlex.join(words if camera is None else [*words, "--camera", camera])

@@ -49,9 +49,11 @@ def encode_array(array: npt.NDArray[Any], *, magic: bytes = ARRAY_MAGIC) -> byte
     code = _CODES.get(dtype)
     if code is None or array.ndim > 8:
         raise CodecError(f"an array of {array.dtype} with {array.ndim} dimensions cannot be stored")
-    body = struct.pack(f"<{array.ndim}I", *array.shape) + np.ascontiguousarray(array, dtype=dtype).tobytes()
+    values = np.ascontiguousarray(array, dtype=dtype)
+    sizes, data = struct.pack(f"<{array.ndim}I", *array.shape), values.reshape(-1).view(np.uint8).data
     start = _HEADER.pack(magic, _SINCE.get(code, 1), code, array.ndim, 0, 0)[:_CHECKED]
-    return start + struct.pack("<I", crc32(body, crc32(start))) + body
+    checksum = crc32(data, crc32(sizes, crc32(start)))
+    return b"".join((start, struct.pack("<I", checksum), sizes, data))
 
 
 def decode_array(blob: bytes, where: str, *, magic: bytes = ARRAY_MAGIC) -> npt.NDArray[Any]:

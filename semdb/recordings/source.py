@@ -37,8 +37,14 @@ def write_source(address: str, camera: str | None) -> str:
 
 def parse_source(source: str) -> tuple[str, Camera | None]:
     """The folder or URL, and the camera, of `write_source`."""
+    where, camera = split_source(source)
+    return where, None if camera is None else parse_camera(camera)
+
+
+def split_source(source: str) -> tuple[str, str | None]:
+    """The folder or URL, and the camera as it was given by hand, of `write_source`."""
     where, found, camera = source.partition(_CAMERA)
-    return where, parse_camera(camera) if found else None
+    return where, camera if found else None
 
 
 def locate(address: str, settings: Settings) -> Path:

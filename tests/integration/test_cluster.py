@@ -7,8 +7,9 @@ import time
 from collections.abc import Iterator
 
 import pytest
+from sqlalchemy import text
 
-from semdb.database import schema
+from semdb.database import retry, schema
 from semdb.database.engine import make_engine
 from semdb.database.store import open_store
 from semdb.errors import DatabaseError
@@ -16,8 +17,7 @@ from semdb.ingest import IngestOptions, ingest_recordings
 from semdb.recordings.synthetic import SyntheticOptions
 from semdb.settings import Settings
 from tests import servers, services
-from tests.integration.comparison import rows_per_table
-from tests.integration.test_ingest import content
+from tests.integration.comparison import content, rows_per_table
 from tests.rooms import render
 
 LONGEST_GAP_S = 15.0
@@ -56,19 +56,29 @@ def test_concurrent_ingest_a_killed_node_and_its_return(
 
     gaps: list[float] = []
     ended = threading.Event()
+    cluster.nodes[0].execute("CREATE TABLE semdb.beats (number INT PRIMARY KEY)")
+    beat = text("INSERT IGNORE INTO beats VALUES (:number)")
 
     def watch() -> None:
-        """The longest time in which the URL whose first node is killed answers nobody."""
-        last = time.monotonic()
+        """The longest times in which nobody can write, nor read what was written, where the killed node is first."""
+        last, number = time.monotonic(), 0
         with open_store(cluster.url(1)) as store:
             while not ended.is_set():
+                number += 1
+                row = {"number": number}
                 try:
-                    store.maps()
+                    retry.write(store.engine, lambda c, row=row: c.execute(beat, row))
+                    newest = retry.read(
+                        store.engine, lambda c: c.execute(text("SELECT MAX(number) FROM beats")).scalar()
+                    )
                 except DatabaseError:
                     continue
+                if newest != number:
+                    wrong.append(AssertionError(f"wrote {number}, read {newest}"))
                 gaps.append(time.monotonic() - last)
                 last = time.monotonic()
                 time.sleep(0.02)
+        gaps.append(time.monotonic() - last)  # that it cannot to this day is a gap, too
 
     threads = [threading.Thread(target=ingest, args=(first,)) for first in range(3)]
     watcher = threading.Thread(target=watch)
@@ -77,11 +87,13 @@ def test_concurrent_ingest_a_killed_node_and_its_return(
             thread.start()
         services.wait_until(lambda: bool(wrong) or rows_per_table(store)["keyframes"] >= 15, "15 keyframes")
         cluster.nodes[1].kill()
+        assert rows_per_table(store)["keyframes"] < FRAMES, "the ingest was over before the node was killed"
         for thread in threads:
             thread.join(120)
         ended.set()
         watcher.join(60)
         assert wrong == []
+        assert len(gaps) > 20
         assert max(gaps) < LONGEST_GAP_S
         with open_store(undisturbed) as expected:
             assert content(store) == content(expected)

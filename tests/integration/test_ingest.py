@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -18,12 +20,10 @@ from semdb.database.store import Store, open_store
 from semdb.errors import ProvenanceError, UsageError
 from semdb.ingest import IngestOptions, ingest_recordings
 from semdb.settings import Settings
-from tests.integration.comparison import rows_per_table
-from tests.rooms import COMMAND, environment
+from tests.integration.comparison import NOT_COMPARED, content, rows_per_table
+from tests.rooms import COMMAND, environment, semdb
 
 KEYFRAMES = 8
-# What a second run of the same ingest may change: when it happened, and ids of rows that were rolled back.
-NOT_COMPARED = {"created_at", "finished_at", "changed_at", "lease_until", "worker", "attempts"}
 
 
 def settings(url: str) -> Settings:
@@ -81,27 +81,6 @@ def test_both_servers_hold_equal_rows(room: Path, tmp_path: Path, mariadb_url: s
     assert dumps[0].keys() == dumps[1].keys()
     for name, rows in dumps[0].items():
         assert rows == dumps[1][name], name
-
-
-def content(store: Store) -> dict[str, list[tuple[Any, ...]]]:
-    """Rows of keyframes as values, free of ids: what a cut-off run has to end with."""
-    from semdb.database.codecs import encode_array
-
-    found: dict[str, list[tuple[Any, ...]]] = {"frames": []}
-    map_id = store.maps()[0].id
-    for stored in store.load_keyframes(store.keyframe_ids(map_id)):
-        vector = store.load_vectors([stored.id])[0]
-        objects = tuple(
-            (o.ordinal, o.category, o.score, o.box.tobytes(), o.geometry.pixel_area) for o in stored.objects
-        )
-        image = store.load_image(stored.id)
-        features = stored.keypoints.features
-        arrays = (vector, features.xy, features.descriptors, stored.keypoints.points, stored.keypoints.object_index)
-        blobs = tuple(encode_array(array) for array in arrays)
-        found["frames"].append((stored.frame_index, stored.timestamp_ns, objects, image.rgb, image.depth, *blobs))
-    found["frames"].sort(key=lambda row: row[0])
-    found["counts"] = sorted(rows_per_table(store).items())
-    return found
 
 
 @pytest.mark.parametrize(("sent", "code"), [(signal.SIGKILL, -signal.SIGKILL), (signal.SIGINT, 130)])
@@ -185,3 +164,30 @@ def test_other_models_and_other_plans_are_refused(room: Path, tmp_path: Path) ->
         ingest_recordings([room], settings(url), IngestOptions(keyframes=4, map_name="m"))
     with open_store(url) as store:
         assert rows_per_table(store)["keyframes"] == 3
+
+
+def test_the_command_that_retry_prints_goes_on_with_the_recording(room: Path, tmp_path: Path) -> None:
+    """A folder with a space in its name, in a map and under a name of somebody's choice, with a camera by hand."""
+    copy = tmp_path / "my room"
+    shutil.copytree(room, copy)
+    broken = sorted((copy / "depth").glob("*.png"))[0]
+    whole = broken.read_bytes()
+    broken.write_bytes(whole[: len(whole) // 2] + b"\xff" + whole[len(whole) // 2 + 1 :])
+    where = {"url": f"sqlite:///{tmp_path / 'a.sqlite3'}", "SEMDB_ENCODER": "gist", "SEMDB_FEATURES": "orb"}
+    camera = json.loads((copy / "camera.json").read_text())
+    numbers = ",".join(str(camera[name]) for name in ("fx", "fy", "cx", "cy"))
+    chosen = ("--map", "the house", "--name", "visit", "--camera", numbers)
+    first = semdb("ingest", copy, "--stride", 8, *chosen, **where)  # type: ignore[arg-type]
+    assert first.returncode == 1, first.stderr
+    broken.write_bytes(whole)
+    printed = semdb("retry", **where).stdout.splitlines()  # type: ignore[arg-type]
+    assert printed[0].startswith("the house/visit: 1 put back; run: semdb ingest ")
+    words = shlex.split(printed[0].partition("run: semdb ")[2])
+    again = semdb(*words, "--json", **where)  # type: ignore[arg-type]
+    assert again.returncode == 0, again.stderr
+    [summary] = json.loads(again.stdout)
+    assert (summary["map"], summary["recording"], summary["keyframes"]) == ("the house", "visit", 3)
+    assert (summary["stored"], summary["already_stored"]) == (1, 2)
+    with open_store(where["url"]) as store:
+        assert [recording.items for recording in store.status()] == [{"done": 3}]
+        assert len(store.maps()) == 1

@@ -112,6 +112,19 @@ def test_watch_ends_when_nothing_is_left(monkeypatch: pytest.MonkeyPatch) -> Non
     assert output.splitlines()[-1].split()[4:7] == ["complete", "2", "2"]
 
 
+@pytest.mark.usefixtures("keyframes")
+def test_watch_does_not_wait_for_what_is_being_deleted() -> None:
+    from sqlalchemy import update
+
+    from semdb.database.tables import recordings
+
+    with open_store("sqlite:///semdb.sqlite3") as store, store.engine.begin() as connection:
+        connection.execute(update(recordings).where(recordings.c.name == "first visit").values(state="deleting"))
+    output = run("status", "--watch").stdout
+    assert output.count("first visit") == 1
+    assert "deleting" in output
+
+
 def test_retry_puts_failed_keyframes_back() -> None:
     from tests.database_samples import MODELS
 
@@ -122,7 +135,8 @@ def test_retry_puts_failed_keyframes_back() -> None:
         assert store.finish_recording(planned.recording_id) == "complete"
     assert "failed: broken frame 4, attempt 1: rgb/4.png: the file ends too early" in run("status").stdout
 
-    assert run("retry").stdout.startswith("room/broken: 2 put back; run: semdb ingest recordings/broken\n")
+    printed = run("retry").stdout
+    assert printed.startswith("room/broken: 2 put back; run: semdb ingest recordings/broken --map room --name broken\n")
     (entry,) = json.loads(run("status", "--json").stdout)
     assert entry["items"] == {"pending": 2}
     assert entry["state"] == "ingesting"
