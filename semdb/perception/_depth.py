@@ -92,7 +92,7 @@ def smooth_surface(mask, depth, top, left, step, smooth):  # type: ignore[no-unt
             nearest = min(right if right > 0 else z, below if below > 0 else z)
             out[x] = np.uint8((z > 0) & (max(right, below) <= z * step) & (z <= nearest * step))
             found = np.int32(found + np.int32(z > 0))
-        known += found
+        known += int(found)
     return known
 
 

@@ -124,7 +124,7 @@ def _triangles_of_row(  # type: ignore[no-untyped-def]  # pragma: no cover
     begin = row * columns + half
     a, b = np.uintp(begin + half * columns), np.uintp(begin + half * columns + 1 - 2 * half)
     c = np.uintp(begin + (1 - half) * columns)
-    several = 0
+    several = np.int32(0)  # as wide as everything else: a wider number would halve how many go at a time
     for k in range(columns - 1):
         x = np.uintp(k)
         ua, ub, uc = flat_u[a + x], flat_u[b + x], flat_u[c + x]
@@ -144,7 +144,7 @@ def _triangles_of_row(  # type: ignore[no-untyped-def]  # pragma: no cover
         value[x] = wa + share_b * (wb - wa) + share_c * (wc - wa)
         pixel = np.int32(np.int32(np.int32(top) * np.int32(width)) + np.int32(left))
         place[x] = (pixel if inside else NONE) if used & single else (SEVERAL if used else NONE)
-        several += used & ~single
+        several = np.int32(several + np.int32(used & ~single))
     return several
 
 
