@@ -1,7 +1,8 @@
 """Deleting: foreign keys cascade, and each keyframe leaves a row in the change log.
 
-Large deletions go in chunks of keyframes, each one transaction, so that no server has to hold or replicate a huge one.
-A recording is marked first: when the process ends in the middle, running the same deletion again finishes it.
+Large deletions go in chunks, each one transaction, so that no server has to hold or replicate a huge one, and no
+statement takes as long as a server that hangs. A recording is marked first: when the process ends in the middle,
+running the same deletion again finishes it.
 """
 
 from __future__ import annotations
@@ -9,14 +10,24 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 
-from sqlalchemy import Connection, Engine, delete, insert, literal, select, update
+from sqlalchemy import Column, Connection, Engine, delete, insert, literal, select, update
 
 from semdb.database import retry
 from semdb.database.records import ChangeKind, Deleted, ItemState, RecordingState
-from semdb.database.tables import cameras, ingest_items, keyframe_changes, keyframes, map_models, maps, recordings
+from semdb.database.tables import (
+    cameras,
+    ingest_items,
+    keyframe_changes,
+    keyframes,
+    map_models,
+    maps,
+    queries,
+    recordings,
+)
 from semdb.errors import NotFoundError
 
-CHUNK = 200
+CHUNK = 200  # keyframes
+SMALL_CHUNK = 5000  # rows of tables that nothing refers to
 Progress = Callable[[int, int], None]
 
 
@@ -73,7 +84,7 @@ def delete_recording(engine: Engine, recording_id: int, progress: Progress | Non
         return int(map_id), list(connection.execute(query).scalars())
 
     def finish(connection: Connection) -> int:
-        # A writer that was under way may have added keyframes after the list was made.
+        # A writer that was under way may have added keyframes after the list was made; by now none can be.
         query = select(keyframes.c.id).where(keyframes.c.recording_id == recording_id)
         late = _delete_chunk(connection, list(connection.execute(query).scalars()))
         connection.execute(delete(recordings).where(recordings.c.id == recording_id))
@@ -83,6 +94,9 @@ def delete_recording(engine: Engine, recording_id: int, progress: Progress | Non
 
     map_id, keyframe_ids = retry.write(engine, mark)
     deleted = delete_keyframes(engine, keyframe_ids, progress)
+    # Each writer changes its row of the plan first and holds it until it commits: this waits for those that have, and
+    # refuses the others. Were it left to the foreign key, keyframes that commit meanwhile would go without a trace.
+    _delete_rows(engine, ingest_items.c.recording_id, recording_id, ingest_items.c.frame_index)
     deleted += retry.write(engine, finish)
     _drop_orphans(engine)
     return Deleted(recordings=1, keyframes=deleted)
@@ -95,8 +109,24 @@ def delete_map(engine: Engine, map_id: int, progress: Progress | None = None) ->
     query = select(recordings.c.id).where(recordings.c.map_id == map_id).order_by(recordings.c.id)
     recording_ids = retry.read(engine, lambda c: list(c.execute(query).scalars()))
     deleted = sum(delete_recording(engine, recording_id, progress).keyframes for recording_id in recording_ids)
+    for table in (keyframe_changes, queries):
+        _delete_rows(engine, table.c.map_id, map_id, table.c.id)
     retry.write(engine, lambda c: c.execute(delete(maps).where(maps.c.id == map_id)))
     return Deleted(recordings=len(recording_ids), keyframes=deleted)
+
+
+def _delete_rows(engine: Engine, owner: Column[int], owner_id: int, number: Column[int]) -> None:
+    """All rows of a table where `owner` is `owner_id`, in chunks by `number`, which is unique among them."""
+
+    def work(connection: Connection) -> bool:
+        query = select(number).where(owner == owner_id).order_by(number).limit(SMALL_CHUNK)
+        numbers = list(connection.execute(query).scalars())
+        if numbers:
+            connection.execute(delete(owner.table).where(owner == owner_id, number <= numbers[-1]))
+        return bool(numbers)
+
+    while retry.write(engine, work):
+        pass
 
 
 def _drop_orphans(engine: Engine) -> None:

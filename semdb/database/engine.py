@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,11 @@ from semdb.database.tls import TLS_KEYS, tls_arguments
 from semdb.errors import DatabaseError, UsageError
 
 CONNECT_TIMEOUT_S = 5
+READ_TIMEOUT_S = 120  # more than the 50 s that a server lets a statement wait for a lock: that answer comes first
 BUSY_TIMEOUT_MS = 30_000
-WRITE = "semdb_write"  # execution option: the transaction will write
+WRITE = "semdb_write"  # execution option of transactions that may be run again (`retry`): whether they write
+# Seconds: a machine that is gone is noticed after a minute, also where a statement may take any time.
+_KEEPALIVE = (("TCP_KEEPIDLE", 30), ("TCP_KEEPINTVL", 10), ("TCP_KEEPCNT", 3))
 _SERVER_SETTINGS = (
     "SET SESSION time_zone = '+00:00'",
     "SET SESSION sql_mode = 'STRICT_TRANS_TABLES,NO_ZERO_DATE,ERROR_FOR_DIVISION_BY_ZERO,NO_ENGINE_SUBSTITUTION'",
@@ -31,20 +35,21 @@ def parse_url(url: str) -> URL:
     hint = "use sqlite:///FILE or mysql+pymysql://USER:PASSWORD@HOST/SCHEMA"
     try:
         parsed = make_url(split_hosts(url))
-    except (ArgumentError, ValueError) as error:
-        raise UsageError(f"the database URL cannot be read; {hint}") from error
+    except (ArgumentError, ValueError):  # they may hold a part of the password
+        raise UsageError(f"the database URL cannot be read; {hint}") from None
     backend = parsed.get_backend_name()
     if backend == "sqlite":
         if parsed.database in (None, "", ":memory:"):
             raise UsageError(f"a database in memory is not supported, it needs a file; {hint}")
         return parsed.set(drivername="sqlite")
     if backend in ("mysql", "mariadb"):
-        if not parsed.database:
-            raise UsageError(f"the database URL {safe_url(parsed)} names no schema; {hint}")
         unknown = sorted(set(parsed.query) - TLS_KEYS - {HOSTS})
         if unknown:  # a misspelled ssl_mode must not connect without TLS
             known = ", ".join(sorted(TLS_KEYS))
-            raise UsageError(f"the database URL {safe_url(parsed)} has a parameter {unknown[0]!r}; known are {known}")
+            where = safe_url(parsed.difference_update_query(unknown))  # they may be passwords
+            raise UsageError(f"the database URL {where} has a parameter {unknown[0]!r}; known are {known}")
+        if not parsed.database:
+            raise UsageError(f"the database URL {safe_url(parsed)} names no schema; {hint}")
         tls_arguments(parsed)
         return parsed.set(drivername="mysql+pymysql")
     raise UsageError(f"databases of the kind {backend!r} are not supported; {hint}")
@@ -56,7 +61,10 @@ def safe_url(url: URL) -> str:
 
 
 def make_engine(url: str, *, read_timeout_s: int | None = None) -> Engine:
-    """An engine for `url`. Connects only when used. Raises UsageError for a URL that cannot be used."""
+    """An engine for `url`; see `make_server_engine`. Connects only when used.
+
+    Raises UsageError for a URL that cannot be used.
+    """
     parsed = parse_url(url)
     if parsed.get_backend_name() == "sqlite":
         return _sqlite_engine(parsed)
@@ -86,9 +94,14 @@ def _sqlite_engine(url: URL) -> Engine:
 
 
 def make_server_engine(url: URL, read_timeout_s: int | None = None) -> Engine:
-    """An engine for a server; its URL may leave out the schema."""
+    """An engine for a server; its URL may leave out the schema.
+
+    A server that says nothing for so long is given up, as one that closed the connection: when it is asked to connect,
+    or whether a connection is still good, CONNECT_TIMEOUT_S; within a transaction that may be run again,
+    READ_TIMEOUT_S; else `read_timeout_s`, by default never, since a change of tables takes as long as it takes.
+    """
     # The driver's limit for connecting ends before the greeting: one that never comes needs the limit for reading.
-    limits = {"connect_timeout": CONNECT_TIMEOUT_S, "read_timeout": CONNECT_TIMEOUT_S}
+    limits = dict.fromkeys(("connect_timeout", "read_timeout", "write_timeout"), CONNECT_TIMEOUT_S)
     engine = create_engine(
         url,
         connect_args={**limits, "charset": "utf8mb4", "cursorclass": BlobCursor, **tls_arguments(url)},
@@ -104,19 +117,46 @@ def make_server_engine(url: URL, read_timeout_s: int | None = None) -> Engine:
             del parameters[name]  # what the dialect made of the URL's query
         return failover.connect(dialect, {**parameters, **tls_arguments(url)})
 
-    @event.listens_for(engine, "connect")
-    def _configure(connection: Any, record: Any) -> None:
-        with connection.cursor() as cursor:
-            for statement in _SERVER_SETTINGS:
-                cursor.execute(statement)
-            cursor.execute("SHOW SESSION VARIABLES WHERE Variable_name IN ('wsrep_sync_wait', 'max_allowed_packet')")
-            variables = dict(cursor.fetchall())
-            if "wsrep_sync_wait" in variables:  # reads see what this cluster has committed
-                cursor.execute("SET SESSION wsrep_sync_wait = 1")
-            record.info["max_allowed_packet"] = int(variables["max_allowed_packet"])
-        connection._read_timeout = read_timeout_s  # statements may take longer than a greeting
-
+    event.listen(engine, "connect", _configure_server)
+    _limit_waiting(engine, read_timeout_s)
     return engine
+
+
+def _configure_server(connection: Any, record: Any) -> None:
+    for name, value in _KEEPALIVE:
+        if hasattr(socket, name):  # not on every system
+            connection._sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+    with connection.cursor() as cursor:
+        for statement in _SERVER_SETTINGS:
+            cursor.execute(statement)
+        cursor.execute("SHOW SESSION VARIABLES WHERE Variable_name IN ('wsrep_sync_wait', 'max_allowed_packet')")
+        variables = dict(cursor.fetchall())
+        if "wsrep_sync_wait" in variables:  # reads see what this cluster has committed
+            cursor.execute("SET SESSION wsrep_sync_wait = 1")
+        record.info["max_allowed_packet"] = int(variables["max_allowed_packet"])
+
+
+def _limit_waiting(engine: Engine, read_timeout_s: int | None) -> None:
+    """How long the driver waits for a server, by what the connection is used for; see `make_server_engine`."""
+
+    @event.listens_for(engine, "checkout")
+    def _lent(connection: Any, _record: Any, _proxy: Any) -> None:
+        _set_limit(connection, read_timeout_s)
+
+    @event.listens_for(engine, "begin")
+    def _begin(connection: Connection) -> None:
+        if WRITE in connection.get_execution_options():
+            _set_limit(connection.connection.driver_connection, READ_TIMEOUT_S)
+
+    @event.listens_for(engine, "checkin")
+    def _given_back(connection: Any, _record: Any) -> None:
+        if connection is not None:  # it is asked whether it is still good before it is lent again
+            _set_limit(connection, CONNECT_TIMEOUT_S)
+
+
+def _set_limit(connection: Any, seconds: int | None) -> None:
+    # The driver has no public name for it. Sending has a limit too: a server that hangs reads nothing either.
+    connection._read_timeout = connection._write_timeout = seconds
 
 
 def check_packet(connection: Connection, size: int, what: str) -> None:

@@ -12,11 +12,17 @@ from semdb.errors import UsageError
 
 HOSTS = "hosts"  # query parameter that holds the hosts after the first
 NOT_READY = 1047
-_NETLOC = re.compile(r"(?P<head>[\w+]+://(?:[^@/]*@)?)(?P<hosts>[^/?#@]+)(?P<tail>.*)", re.DOTALL)
+_NETLOC = re.compile(r"(?P<head>[\w+]+://(?:[^@]*@)?)(?P<hosts>[^/?]+)(?P<tail>.*)", re.DOTALL)
+_SERVER = re.compile(r"(?:mysql|mariadb)\b[\w+]*://(?P<authority>[^/?]*)(?P<tail>.*)", re.DOTALL)
+_HOST = re.compile(r"(?P<name>\[[^\[\]]+\]|[^:\[\]]+)(?::(?P<port>[0-9]+))?")
 
 
 def split_hosts(url: str) -> str:
-    """`url` with its first host alone, the others in the query, so that it is a URL as any other."""
+    """`url` with its first host alone, the others in the query, so that it is a URL as any other.
+
+    Raises UsageError, which shows nothing of `url`, where a character of the password could also end it.
+    """
+    _check_escapes(url)
     found = _NETLOC.fullmatch(url)
     if found is None or "," not in found["hosts"]:
         return url
@@ -27,15 +33,24 @@ def split_hosts(url: str) -> str:
     return f"{found['head']}{first}{found['tail']}{separator}{HOSTS}={','.join(others)}"
 
 
+def _check_escapes(url: str) -> None:
+    """One @, and before any / and ?: else a part of a password could be taken for a host, which messages show."""
+    found = _SERVER.fullmatch(url)
+    if found is not None and ("@" in found["tail"] or found["authority"].count("@") > 1):
+        raise UsageError(
+            "the database URL can be read in several ways: write each @ of user, password, schema and parameters as "
+            "%40, and each / and ? of user and password as %2F and %3F"
+        )
+
+
 def join_hosts(text: str, url: URL) -> str:
     """The rendered `text` of `url` as a person writes it."""
     others = url.query.get(HOSTS)
     if not isinstance(others, str) or not url.host:
         return text
-    shown = url.update_query_dict({}).difference_update_query([HOSTS])
-    own = f"{url.host}:{url.port}" if url.port else str(url.host)
-    head, _, tail = shown.render_as_string(hide_password=True).rpartition(f"{own}")
-    return f"{head}{own},{others}{tail}"
+    shown = url.difference_update_query([HOSTS]).render_as_string(hide_password=True)
+    found = _NETLOC.fullmatch(shown)
+    return text if found is None else f"{found['head']}{found['hosts']},{others}{found['tail']}"
 
 
 class Failover:
@@ -78,7 +93,9 @@ def _check_ready(connection: Any) -> None:
 
 
 def _host(text: str) -> tuple[str, int]:
-    name, _, port = text.rpartition(":") if ":" in text else (text, "", "3306")
-    if not name or not port.isdigit():
-        raise UsageError(f"{text!r} is no HOST:PORT in the list of hosts of the database URL")
-    return name, int(port)
+    found = _HOST.fullmatch(text)
+    if found is None:
+        raise UsageError(
+            f"{text!r} is no HOST:PORT in the list of hosts of the database URL; addresses of IPv6 are in brackets"
+        )
+    return found["name"].strip("[]"), int(found["port"] or 3306)

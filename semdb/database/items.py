@@ -62,14 +62,18 @@ class QueuedItems:
 
 
 def worker_name() -> str:
-    """A name that no other worker has; it tells the machine and the process: ``HOST!SPACE!PID!START!RANDOM``."""
+    """A name that no other worker has; it tells the machine and the process: ``HOST!SPACE!PID!START!RANDOM``.
+
+    SPACE is of which start of which kernel, and of which of its tables of processes.
+    """
     return "!".join((*_machine(), str(os.getpid()), _started(os.getpid()) or "0", secrets.token_hex(4)))
 
 
 def worker_is_gone(name: str) -> bool:
     """Whether `name` is a worker of this machine whose process has ended. False where that cannot be known."""
     parts = name.split("!")
-    if len(parts) != 5 or tuple(parts[:2]) != _machine() or not parts[2].isdigit():
+    here = _machine()
+    if not here[1] or len(parts) != 5 or tuple(parts[:2]) != here or not parts[2].isdigit():
         return False
     return _started(int(parts[2])) != parts[3]
 
@@ -222,12 +226,18 @@ def mark_sent(engine: Engine, recording_id: int, frame_indexes: Sequence[int], w
 
 
 def _machine() -> tuple[str, str]:
-    """Name of this machine and its table of processes: containers on one machine have one each."""
+    """Name of this machine, and its table of processes ("" where that is not known).
+
+    Containers on one machine have a table each; the first table of every machine has the same number, and machines may
+    have the same name, so the random number of the kernel's start belongs to it.
+    """
     try:
         space = os.readlink("/proc/self/ns/pid").strip("pid:[]")
+        with open("/proc/sys/kernel/random/boot_id") as file:
+            start = file.read().strip().replace("-", "")[:12]
     except OSError:
-        space = ""
-    return socket.gethostname().replace("!", "")[:64], space
+        start = space = ""
+    return socket.gethostname().replace("!", "")[:64], f"{start}.{space}" if start and space else ""
 
 
 def _started(pid: int) -> str | None:

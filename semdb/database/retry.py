@@ -1,10 +1,11 @@
 """The one place where a transaction is run, and run again when the database asks for it.
 
-Retried with back-off: deadlock and failed certification (1213), lock timeout (1205), lost connection (2006, 2013; 2003
-while a server that has answered before restarts), a server that shuts down or has no connection left (1053, 1040), a
-cluster node that is not ready (1047), and a busy SQLite file. The work is given a fresh transaction each time, so
-it must not keep anything from an earlier attempt; all writes of semdb are idempotent, so a commit whose answer was lost
-is safe to repeat. What lasts longer is repeated by workers as whole tasks, by the same rules: `task_delay_s`.
+Retried with back-off: deadlock and failed certification (1213), lock timeout (1205), lost connection (2006, 2013, also
+when a server hangs and says nothing for `READ_TIMEOUT_S`; 2003 while a server that has answered before restarts), a
+server that shuts down or has no connection left (1053, 1040), a cluster node that is not ready (1047), and a busy
+SQLite file. The work is given a fresh transaction each time, so it must not keep anything from an earlier attempt; all
+writes of semdb are idempotent, so a commit whose answer was lost is safe to repeat. What lasts longer is repeated by
+workers as whole tasks, by the same rules: `task_delay_s`.
 """
 
 from __future__ import annotations
@@ -38,6 +39,9 @@ _NO_ROOM = {3, 28, 1021, 1026, 1114}
 _UNREACHABLE = {2002, 2003, 2005}
 _LOST = {2006, 2013}
 _DENIED = {1044, 1045, 1049, 1698, 1142, 1227}
+_NO_TLS, _TLS_ONLY, _WRONG_ACCOUNT = 2026, 3159, 1045
+
+_NO_ROOM_ADVICE = "cannot grow: its disk, or the room that it was given, is full; make room and run the command again"
 
 
 def read(engine: Engine, work: Callable[[Connection], T]) -> T:
@@ -119,30 +123,55 @@ def explain(
     engine: Engine, error: Exception, attempts: int = 1, *, setting: str = "SEMDB_DATABASE_URL"
 ) -> DatabaseError:
     """The error for people: which database, what it said, what to do. `setting` is where its URL came from."""
-    where = safe_url(engine.url)
     reason = str(getattr(error, "orig", None) or error).splitlines()[0]
     code = error_code(error)
     name = getattr(getattr(error, "orig", None), "sqlite_errorname", "") or ""
-    if code in _UNREACHABLE or (code in _LOST and engine not in _answered):
-        advice = f"does not answer: check that the server runs and that host and port of {setting} are right"
-    elif code in _DENIED:
-        advice = f"refuses: check user, password and schema of {setting}, and the account's rights"
-    elif name == "SQLITE_CANTOPEN":
-        advice = "cannot be opened: check that its folder exists and can be written"
-    elif name == "SQLITE_NOTADB":
-        advice = f"is not a database: check the path of {setting}"
-    elif name.startswith("SQLITE_CORRUPT"):
-        advice = "is damaged: restore it from a backup, or delete the file and ingest again"
-    elif name.startswith(("SQLITE_BUSY", "SQLITE_LOCKED")):
-        advice = "is held by another process: wait for it or end it"
-    elif name == "SQLITE_READONLY" or name.startswith("SQLITE_READONLY"):
-        advice = "cannot be written: check the rights of the file and its folder"
-    elif name == "SQLITE_FULL" or code in _NO_ROOM:
-        advice = "cannot grow: its disk, or the room that it was given, is full; make room and run the command again"
-    elif code in RETRIED_CODES:
-        advice = f"failed {attempts} times in a row: the server is down or overloaded; run the command again"
-    else:
-        advice = "refused a statement"
+    advice = _of_tls(engine, code, reason, setting) or _of_sqlite(name, setting)
+    if advice is None:
+        advice = _of_server(code, attempts, setting, answered=engine in _answered)
     heals = is_busy(error) or code in _UNREACHABLE | _LOST | _NO_ROOM | RETRIED_CODES or name == "SQLITE_FULL"
     kind = DatabaseUnavailableError if heals else DatabaseError
-    return kind(f"the database {where} {advice} ({reason})")
+    return kind(f"the database {safe_url(engine.url)} {advice} ({reason})")
+
+
+def _of_tls(engine: Engine, code: int | None, reason: str, setting: str) -> str | None:
+    """What to do about a connection that is not, or not as it has to be, encrypted; None for other errors."""
+    if code == _NO_TLS:
+        return f"has no TLS, and {setting} asks for it: set TLS up on the server, or change ssl_mode"
+    if code in _UNREACHABLE | _LOST and "[SSL" in reason and "EOF" not in reason:  # EOF: the server has ended
+        return (
+            f"answers, but TLS failed: check that ssl_ca of {setting} is the certificate, or the authority, of this "
+            "server, that its certificate is for this host and not out of date, and ssl_cert and ssl_key where given"
+        )
+    unencrypted = str(engine.url.query.get("ssl_mode", "")).upper() == "DISABLED"
+    if code == _TLS_ONLY or (code == _WRONG_ACCOUNT and unencrypted):
+        others = "" if code == _TLS_ONLY else f"check user and password of {setting}; or it "
+        return f"refuses: {others}takes encrypted connections only: remove ssl_mode=DISABLED from {setting}"
+    return None
+
+
+def _of_sqlite(name: str, setting: str) -> str | None:
+    """What to do about an error of SQLite of that `name`; None for others."""
+    if name == "SQLITE_CANTOPEN":
+        return "cannot be opened: check that its folder exists and can be written"
+    if name == "SQLITE_NOTADB":
+        return f"is not a database: check the path of {setting}"
+    if name.startswith("SQLITE_CORRUPT"):
+        return "is damaged: restore it from a backup, or delete the file and ingest again"
+    if name.startswith(("SQLITE_BUSY", "SQLITE_LOCKED")):
+        return "is held by another process: wait for it or end it"
+    if name.startswith("SQLITE_READONLY"):
+        return "cannot be written: check the rights of the file and its folder"
+    return _NO_ROOM_ADVICE if name == "SQLITE_FULL" else None
+
+
+def _of_server(code: int | None, attempts: int, setting: str, *, answered: bool) -> str:
+    if code in _UNREACHABLE or (code in _LOST and not answered):
+        return f"does not answer: check that the server runs and that host and port of {setting} are right"
+    if code in _DENIED:
+        return f"refuses: check user, password and schema of {setting}, and the account's rights"
+    if code in _NO_ROOM:
+        return _NO_ROOM_ADVICE
+    if code in RETRIED_CODES:
+        return f"failed {attempts} times in a row: the server is down or overloaded; run the command again"
+    return "refused a statement"

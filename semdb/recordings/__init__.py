@@ -7,6 +7,7 @@ from pathlib import Path
 from semdb.errors import RecordingError
 from semdb.recordings.base import DroppedFrame, FrameEntry, Recording, register_depth
 from semdb.recordings.cameras import parse_camera
+from semdb.recordings.credentials import refuse_credentials
 from semdb.recordings.icl_nuim import is_icl_nuim, open_icl_nuim
 from semdb.recordings.images import decode_color, decode_depth, read_depth_image, read_query_image
 from semdb.recordings.seven_scenes import find_sequences, is_seven_scenes, open_seven_scenes
@@ -66,6 +67,7 @@ def open_recording(path: Path | str, camera: Camera | None = None) -> Recording:
 
 
 def _check_folder(folder: Path) -> None:
+    refuse_credentials(str(folder))  # a URL where only a folder is taken is shown in the message
     if not folder.exists():
         raise RecordingError(f"{folder}: no such folder")
     if not folder.is_dir():

@@ -16,6 +16,7 @@ from typing import Any
 
 from semdb.errors import RecordingError, RecordingUnavailableError, UsageError
 from semdb.recordings.cameras import parse_camera
+from semdb.recordings.credentials import refuse_credentials
 from semdb.settings import Settings
 from semdb.types import Camera
 
@@ -30,7 +31,11 @@ def is_address(path: str) -> bool:
 
 
 def write_source(address: str, camera: str | None) -> str:
-    """What the database keeps: the absolute folder or the URL, and the camera where one was given by hand."""
+    """What the database keeps: the absolute folder or the URL, and the camera where one was given by hand.
+
+    Raises UsageError for a URL with a password.
+    """
+    refuse_credentials(address)
     where = address if is_address(address) else str(Path(address).absolute())
     return where if camera is None else f"{where}{_CAMERA}{camera}"
 
@@ -50,9 +55,10 @@ def split_source(source: str) -> tuple[str, str | None]:
 def locate(address: str, settings: Settings) -> Path:
     """The folder on this machine: `address` itself, or the copy of a URL, brought up to date.
 
-    Raises UsageError where fsspec, or what it needs for this kind of URL, is not installed, RecordingError for a URL
-    with nothing under it, RecordingUnavailableError when it cannot be reached.
+    Raises UsageError for a URL with a password, or where fsspec, or what it needs for this kind of URL, is not
+    installed, RecordingError for a URL with nothing under it, RecordingUnavailableError when it cannot be reached.
     """
+    refuse_credentials(address)
     if not is_address(address):
         return Path(address)
     return fetch(address, settings.cache_dir.expanduser() / "recordings")

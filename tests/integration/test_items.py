@@ -76,10 +76,24 @@ def test_a_worker_of_this_machine_that_died_is_not_waited_for(store: Store, reco
     assert items.worker_is_gone(ended)
     assert not items.worker_is_gone(items.worker_name())
     assert not items.worker_is_gone("somewhere-else!1!2!3!abc")
+    assert len(ended) <= ingest_items.c.worker.type.length  # type: ignore[attr-defined]
     claim(store.engine, recording, ended, limit=2)
     claim(store.engine, recording, items.worker_name(), limit=1)
     assert items.release_dead(store.engine, recording) == 2
     assert items.left(store.engine, recording) == (4, 1)
+
+
+def test_a_worker_is_only_gone_where_that_can_be_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    host, space = items._machine()
+    start, _, table = space.partition(".")
+    assert len(start) == 12
+    assert table.isdigit()
+    assert items.worker_is_gone(f"{host}!{space}!{2**22 + 1}!77!abc")
+    # A machine of the same name whose first table of processes has the same number, as all have.
+    assert not items.worker_is_gone(f"{host}!{'0' * 12}.{table}!{2**22 + 1}!77!abc")
+    assert not items.worker_is_gone(f"{host}!{table}!{2**22 + 1}!77!abc")  # as older versions wrote it
+    monkeypatch.setattr(items, "_machine", lambda: (host, ""))  # no /proc
+    assert not items.worker_is_gone(f"{host}!!{2**22 + 1}!77!abc")
 
 
 def test_a_keyframe_that_kills_its_workers_fails_in_the_end(store: Store, recording: int) -> None:

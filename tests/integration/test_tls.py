@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import datetime
 import ipaddress
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
+import pymysql
 import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 from sqlalchemy import text
+from sqlalchemy.exc import OperationalError
 
 from semdb.database.engine import make_engine, parse_url
-from semdb.database.retry import read
+from semdb.database.retry import explain, read
 from semdb.errors import DatabaseError, UsageError
 from tests import servers
+from tests.conftest import REPOSITORY
 
 
 def write_certificate(folder: Path, name: str, host: str) -> tuple[Path, Path]:
@@ -74,30 +78,54 @@ def cipher(url: str) -> str:
 
 def test_the_url_decides(server: servers.Server, certificates: Path) -> None:
     assert cipher(server.url(query="?ssl_mode=DISABLED")) == ""
-    assert cipher(server.url(query="?ssl_mode=REQUIRED")) != ""
+    for query in ("", "?ssl_mode=PREFERRED", "?ssl_mode=REQUIRED"):
+        assert cipher(server.url(query=query)) != ""
     for mode in ("", "&ssl_mode=VERIFY_CA", "&ssl_mode=VERIFY_IDENTITY"):
         assert cipher(server.url(query=f"?ssl_ca={certificates / 'server.pem'}{mode}")) != ""
 
 
+def test_the_oldest_driver_that_is_allowed_prefers_tls() -> None:
+    """Before 1.2.0 the driver connected without TLS where it was not told to."""
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+    assert [line for line in project["dependencies"] if line.startswith("pymysql")] == ["pymysql[rsa]>=1.2.0,<2"]
+
+
 def test_a_certificate_that_is_not_trusted_is_refused(server: servers.Server, certificates: Path) -> None:
-    with pytest.raises(DatabaseError, match=r"does not answer|refused") as caught:
+    where = "answers, but TLS failed: check that ssl_ca of SEMDB_DATABASE_URL is"
+    with pytest.raises(DatabaseError, match=rf"{where}.*self-signed certificate") as caught:
         cipher(server.url(query=f"?ssl_ca={certificates / 'elsewhere.pem'}"))
     assert servers.PASSWORD not in str(caught.value)
     name = server.url(query=f"?ssl_ca={certificates / 'server.pem'}").replace("127.0.0.1", "localhost")
-    with pytest.raises(DatabaseError):
+    with pytest.raises(DatabaseError, match=rf"{where}.*mismatch"):
         cipher(name)
 
 
 def test_a_server_without_tls_is_refused_where_the_url_asks_for_it(mariadb_url: str) -> None:
     assert cipher(f"{mariadb_url}?ssl_mode=DISABLED") == ""
-    with pytest.raises(DatabaseError):
+    assert cipher(f"{mariadb_url}?ssl_mode=PREFERRED") == ""
+    with pytest.raises(DatabaseError, match="has no TLS, and SEMDB_DATABASE_URL asks for it"):
         cipher(f"{mariadb_url}?ssl_mode=REQUIRED")
+
+
+def test_a_server_that_takes_tls_only(server: servers.Server) -> None:
+    server.execute("CREATE OR REPLACE USER 'careful'@'127.0.0.1' IDENTIFIED BY 'hush' REQUIRE SSL")
+    server.execute("GRANT ALL ON semdb.* TO 'careful'@'127.0.0.1'")
+    url = f"mysql+pymysql://careful:hush@127.0.0.1:{server.port}/semdb"
+    assert cipher(url) != ""
+    with pytest.raises(DatabaseError, match=r"takes encrypted connections only: remove ssl_mode=DISABLED"):
+        cipher(f"{url}?ssl_mode=DISABLED")
+    mysql = OperationalError("", {}, pymysql.err.OperationalError(3159, "insecure transport"))  # MariaDB says 1045
+    engine = make_engine(url)
+    assert "refuses: takes encrypted connections only" in str(explain(engine, mysql))
+    cut = OperationalError("", {}, pymysql.err.OperationalError(2003, "([SSL: UNEXPECTED_EOF_WHILE_READING] EOF)"))
+    assert "does not answer: check that the server runs" in str(explain(engine, cut))
 
 
 @pytest.mark.parametrize(
     ("query", "message"),
     [
         ("sslmode=REQUIRED", "has a parameter 'sslmode'; known are ssl_ca"),
+        ("passwd=secret", "has a parameter 'passwd'; known are ssl_ca"),
         ("ssl_mode=SOMETIMES", "it is one of DISABLED"),
         ("ssl_mode=VERIFY_CA", "needs ssl_ca=FILE"),
         ("ssl_ca=/no/such/file", "there is no such file"),

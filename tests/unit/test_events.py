@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from semdb.events import LOGGER, event, log_to
-from semdb.recordings.images import PNG_END
+from semdb.recordings import png
 from semdb.recordings.synthetic import SyntheticOptions
 from tests.rooms import render, semdb
 
@@ -71,7 +71,7 @@ def test_a_password_on_the_command_line_is_overwritten_in_the_list_of_processes(
 def test_an_ingest_logs_each_keyframe_on_request(tmp_path: Path) -> None:
     render(tmp_path / "room", SyntheticOptions(frames=3, width=64, height=48))
     (tmp_path / "room" / "rgb" / "1.033333.png").write_bytes(
-        (tmp_path / "room" / "rgb" / "1.033333.png").read_bytes()[:-30] + bytes(18) + PNG_END
+        (tmp_path / "room" / "rgb" / "1.033333.png").read_bytes()[:-30] + bytes(18) + png.END
     )
     url = f"sqlite:///{tmp_path / 'a.sqlite3'}"
     chosen = {"SEMDB_FEATURES": "orb", "SEMDB_LOG_FORMAT": "json"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import pymysql
@@ -28,15 +29,28 @@ def test_a_list_of_hosts_with_parameters() -> None:
     assert "one,two:3308/room" in safe_url(url)
 
 
+def test_a_list_of_addresses_of_ipv6() -> None:
+    text = "mysql+pymysql://me:secret@[::1]:3306,[::1]:3307,[fe80::2],four/room"
+    url = parse_url(text)
+    assert safe_url(url) == text.replace("secret", "***")
+    assert parse_url(url.render_as_string(hide_password=False)) == url
+    assert Failover(url)._hosts == [("::1", 3306), ("::1", 3307), ("fe80::2", 3306), ("four", 3306)]
+
+
+def test_a_schema_with_the_name_of_a_host() -> None:
+    assert safe_url(parse_url("mysql://me@one,two/someone")) == "mysql+pymysql://me@one,two/someone"
+
+
 @pytest.mark.parametrize("hosts", ["one,,two", ",one", "one,"])
 def test_an_empty_place_is_refused(hosts: str) -> None:
     with pytest.raises(UsageError, match="empty place"):
         parse_url(f"mysql://me@{hosts}/room")
 
 
-def test_a_port_that_is_none_is_refused() -> None:
-    with pytest.raises(UsageError, match="'two:x' is no HOST:PORT"):
-        Failover(parse_url("mysql://me@one,two:x/room"))
+@pytest.mark.parametrize("host", ["two:x", "two:", ":3306", "::1", "[::1", "[::1]x", "[]"])
+def test_a_host_or_port_that_is_none_is_refused(host: str) -> None:
+    with pytest.raises(UsageError, match=rf"'{re.escape(host)}' is no HOST:PORT"):
+        Failover(parse_url(f"mysql://me@one,{host}/room"))
 
 
 class Nodes:
