@@ -1,7 +1,8 @@
 """Ingest by a fleet: plans go into the database, messages name keyframes of them, workers do what a message says.
 
 The database holds the truth. A message may be lost, for `sweep` sends another, or arrive twice, for a keyframe is
-claimed before it is worked on. Nothing here knows how messages travel: `send` is given.
+claimed before it is worked on. Whoever does a message sends on what it has not seen done: else keyframes stay planned
+that nothing names. Nothing here knows how messages travel: `send` is given.
 """
 
 from __future__ import annotations
@@ -10,7 +11,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from semdb.database import items
-from semdb.database.planning import StoredPlan, stored_plan
+from semdb.database.planning import StoredPlan, check_models, stored_plan
+from semdb.database.reporting import OpenItem, open_items
 from semdb.database.requeue import requeue_failed
 from semdb.database.store import Store, open_store
 from semdb.errors import NotFoundError, RecordingUnavailableError, UsageError
@@ -79,7 +81,11 @@ def sweep(store: Store, send: Send, *, recording_id: int | None = None, all_pend
     for queued in items.lost(store.engine, recording_id, all_pending=all_pending):
         for chunk in chunks(queued.frame_indexes):
             items.mark_sent(store.engine, queued.recording_id, chunk, MESSAGE_WAIT_S)
-            send(queued.recording_id, queued.source, chunk)
+            try:
+                send(queued.recording_id, queued.source, chunk)
+            except BaseException:
+                items.mark_sent(store.engine, queued.recording_id, chunk, 0)  # the next sweep need not wait
+                raise
             sent += len(chunk)
     return sent
 
@@ -90,15 +96,33 @@ def chunks(indexes: Sequence[int]) -> Iterator[tuple[int, ...]]:
         yield tuple(indexes[start : start + CHUNK])
 
 
+def parts(found: Sequence[OpenItem]) -> list[tuple[int, ...]]:
+    """The free ones of `found` in parts that are worked off one after the other.
+
+    First those that nobody has begun, together. Then those that were begun before, each alone, and what was begun most
+    often last: one that hangs or kills its workers takes no other along, and holds up none but its like.
+    """
+    free = [item for item in found if not item.held]
+    fresh = tuple(item.frame_index for item in free if item.attempts == 0)
+    begun = sorted((item.attempts, item.frame_index) for item in free if item.attempts > 0)
+    return ([fresh] if fresh else []) + [(index,) for _, index in begun]
+
+
 @dataclass(slots=True)
 class ChunkOutcome:
-    """What became of the keyframes of one message. `left`: not done, for the worker was to stop."""
+    """What became of the keyframes of one message. What is `left` or `held` is for the caller to send again.
+
+    `left`: free and not done, as the worker was to stop; they are marked as sent. `held`: another worker is at them,
+    or was and died, which only its lease tells. `gone`: there is no such recording.
+    """
 
     stored: int = 0
     failed: dict[int, str] = field(default_factory=dict)
     lost: int = 0
     left: tuple[int, ...] = ()
+    held: tuple[int, ...] = ()
     complete: bool = False
+    gone: bool = False
 
 
 class Workplace:
@@ -120,36 +144,64 @@ class Workplace:
     ) -> ChunkOutcome:
         """Works off those of `frames` that nobody else has; `note` is told of each that is done.
 
-        A recording that was deleted gives an empty outcome. Raises RecordingUnavailableError for one that cannot be
-        seen here now, UsageError for one that is another here than where it was planned, DatabaseError, ModelError.
+        Where none is open the recording need not be there. One that was deleted gives an outcome that says `gone`.
+        Raises RecordingUnavailableError for one that cannot be seen here now, UsageError for one that is another here
+        than where it was planned, ProvenanceError where this worker has other models, DatabaseError, ModelError.
         """
         outcome = ChunkOutcome()
         with open_store(self._settings.database_url) as store:
             try:
                 plan = stored_plan(store.engine, recording_id)
-                recording = self._recording(plan, source)
-                done = set()
-                describers = self._describers_of(store, plan, recording)
+                items.release_dead(store.engine, recording_id)
+                found = open_items(store.engine, recording_id, frames)
+                if any(not item.held for item in found):
+                    self._work_off(store, plan, source, found, outcome, stop, note)
+                    found = open_items(store.engine, recording_id, frames)
+                outcome.held = tuple(item.frame_index for item in found if item.held)
+                outcome.left = tuple(item.frame_index for item in found if not item.held)
+                if outcome.left:
+                    items.mark_sent(store.engine, recording_id, outcome.left, MESSAGE_WAIT_S)
+                outcome.complete = store.finish_recording(recording_id) == "complete"
+            except NotFoundError:
+                outcome.gone = True  # deleted: there is nothing to do any more
+        return outcome
+
+    def _work_off(
+        self,
+        store: Store,
+        plan: StoredPlan,
+        source: str,
+        found: list[OpenItem],
+        outcome: ChunkOutcome,
+        stop: Callable[[], bool],
+        note: Callable[[Item], None],
+    ) -> None:
+        """Until nothing of `found` is free: a claim whose commit was answered by nobody is only seen when it ended."""
+        recording = self._recording(plan, source)
+        describers = self._describers_of(store, plan, recording)
+        frames = [item.frame_index for item in found]
+        progress = True
+        while progress and not stop():
+            progress = False
+            for part in parts(found):
                 for item in work_off(
                     recording,
-                    recording_id,
+                    plan.recording_id,
                     store,
                     describers,
-                    frames=frames,
+                    frames=part,
                     stop=stop,
                     descriptor_dtype=self._settings.descriptor_dtype,
                 ):
-                    done.add(item.claim.frame_index)
+                    progress = True
                     outcome.stored += item.created
                     outcome.lost += item.lost
                     if item.error is not None and not item.lost:
                         outcome.failed[item.claim.frame_index] = item.error
                     note(item)
-                outcome.left = tuple(frame for frame in frames if frame not in done) if stop() else ()
-                outcome.complete = store.finish_recording(recording_id) == "complete"
-            except NotFoundError:
-                return outcome  # deleted: there is nothing to do any more
-        return outcome
+                if stop():
+                    return
+            found = open_items(store.engine, plan.recording_id, frames)
 
     def _recording(self, plan: StoredPlan, source: str) -> Recording:
         key = (plan.recording_id, source, plan.fingerprint)
@@ -181,4 +233,5 @@ class Workplace:
         key = (specs, own.model_dump_json(exclude={"database_url", "reader_url", "broker_url"}))
         if key not in self._describers:
             self._describers = {key: make_describers(specs, own)}  # of one map at a time: networks are large
+        check_models(models, self._describers[key][0].models, "the map")  # before keyframes are claimed in vain
         return self._describers[key]

@@ -4,9 +4,45 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Annotated, Literal
+from urllib.parse import urlsplit
 
-from pydantic import Field
+from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from semdb.errors import UsageError
+
+# What Celery's transport library knows, in small letters.
+_BROKERS = (
+    "redis rediss sentinel amqp amqps pyamqp librabbitmq qpid sqs kafka confluentkafka mongodb zookeeper sqlalchemy "
+    "sqla slmq filesystem consul etcd azurestoragequeues azureservicebus pyro gcpubsub pgmq memory"
+)
+
+
+class BrokerUrlError(UsageError):
+    """SEMDB_BROKER_URL names no broker. The message leaves the URL out, which may hold a password."""
+
+
+def check_broker_url(url: str) -> str:
+    """`url`, which may be several divided by semicolons. Raises BrokerUrlError for what is no address of a broker."""
+    for one in url.split(";"):
+        scheme, found, _ = one.partition("://")
+        kind = scheme.partition("+")[0].lower()  # sqla+sqlite: a driver of that transport
+        if not found:
+            raise BrokerUrlError(
+                "SEMDB_BROKER_URL is no URL: write redis://HOST:PORT/N, or another of Celery's brokers"
+            )
+        if kind not in _BROKERS.split():
+            raise BrokerUrlError(
+                f"SEMDB_BROKER_URL: there is no broker of the kind {scheme!r}: redis, rediss, amqp, ..."
+            )
+        try:
+            parsed = urlsplit(one)
+            _ = "," in parsed.netloc or parsed.port  # of several hosts only the transport knows what to make
+        except ValueError:
+            raise BrokerUrlError("SEMDB_BROKER_URL: host or port make no sense: write redis://HOST:PORT/N") from None
+        if scheme in ("redis", "rediss") and parsed.path.strip("/") and not parsed.path.strip("/").isdigit():
+            raise BrokerUrlError("SEMDB_BROKER_URL: a database of Redis is a number: redis://HOST:PORT/N")
+    return url
 
 
 class Settings(BaseSettings):
@@ -55,3 +91,8 @@ class Settings(BaseSettings):
         "float32", description="how descriptors of float are stored; float16 takes half the room"
     )
     sql_time_limit_s: float = Field(60.0, gt=0, description="time limit of `semdb sql`")
+
+    @field_validator("broker_url")
+    @classmethod
+    def _broker_url(cls, url: str) -> str:
+        return check_broker_url(url)

@@ -45,6 +45,7 @@ def make_app(settings: Settings) -> Any:
         task_ignore_result=True,  # the database holds the outcome
         task_acks_late=True,  # a worker that dies gives its message back
         task_reject_on_worker_lost=True,
+        task_acks_on_failure_or_timeout=False,  # nor takes one with it whose process was killed at the hard limit
         worker_prefetch_multiplier=1,
         task_serializer="json",
         accept_content=["json"],
@@ -65,13 +66,20 @@ def make_app(settings: Settings) -> Any:
 app = make_app(Settings())
 
 
-def send_items(recording_id: int, source: str, frames: Sequence[int]) -> None:
-    """Sends one message that names keyframes. Raises BrokerError: they stay planned, and a sweep sends them."""
+def send_items(recording_id: int, source: str, frames: Sequence[int], *, delay_s: float | None = None) -> None:
+    """Sends one message that names keyframes, to be done after `delay_s` where given.
+
+    Raises BrokerError: they stay planned, and a sweep sends them.
+    """
     from kombu.exceptions import OperationalError
 
     try:
         app.send_task(
-            ITEMS_TASK, args=[recording_id, source, list(frames)], retry=True, retry_policy={"max_retries": 3}
+            ITEMS_TASK,
+            args=[recording_id, source, list(frames)],
+            countdown=delay_s,
+            retry=True,
+            retry_policy={"max_retries": 3},
         )
     except (OperationalError, OSError) as error:
         where = app.connection_for_write().as_uri()  # without the password

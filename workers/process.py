@@ -48,13 +48,21 @@ def _task_logs(logger: logging.Logger, **_: Any) -> None:
 @signals.worker_ready.connect  # type: ignore[untyped-decorator]
 def _ready(**_: Any) -> None:
     settings = Settings()
-    if settings.metrics_port is not None:
+    _sweep(settings)
+    if settings.metrics_port is None:
+        return
+    try:
         metrics.serve(settings.metrics_port)
+    except OSError as error:  # another worker has the port: keyframes are worth more than numbers about them
+        event("metrics", level=logging.ERROR, port=settings.metrics_port, error=f"not served: {error}")
+
+
+def _sweep(settings: Settings) -> None:
     try:
         with open_store(settings.database_url) as store:
             sent = sweep(store, send_items)
     except SemdbError as error:  # the worker still does what it is sent
-        event("sweep", error=str(error))
+        event("sweep", level=logging.ERROR, error=str(error))
     else:
         event("sweep", sent=sent)
 
@@ -62,3 +70,8 @@ def _ready(**_: Any) -> None:
 @signals.worker_shutting_down.connect  # type: ignore[untyped-decorator]
 def _stop(**_: Any) -> None:
     stopping.request()
+
+
+@signals.worker_shutdown.connect  # type: ignore[untyped-decorator]
+def _ended(**_: Any) -> None:
+    metrics.remove()

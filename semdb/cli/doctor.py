@@ -37,8 +37,9 @@ def command(overrides: Overrides, json: JsonFlag = False) -> None:
     """
     from semdb.cli.output import print_json
 
-    settings = overrides.settings()
-    checks = [check for part in (versions, database, broker, folders, models) for check in guarded(part, settings)]
+    settings, checked_broker = settings_of(overrides)
+    parts = (versions, database, checked_broker, folders, models)
+    checks = [check for part in parts for check in guarded(part, settings)]
     if json:
         print_json([{"state": check.state, "what": check.what, "text": check.text} for check in checks])
     else:
@@ -49,6 +50,21 @@ def command(overrides: Overrides, json: JsonFlag = False) -> None:
     if problems:
         print(f"semdb: {problems} problem{'s' if problems > 1 else ''} found", file=sys.stderr)
         raise typer.Exit(1)
+
+
+def settings_of(overrides: Overrides) -> tuple[Settings, Callable[[Settings], Iterator[Check]]]:
+    """The settings, and what looks at the broker: a wrong URL of it is a finding, and all else is looked at, too.
+
+    Raises UsageError for any other setting that makes no sense.
+    """
+    from semdb.settings import BrokerUrlError, Settings
+
+    try:
+        return overrides.settings(), broker
+    except BrokerUrlError as error:
+        finding = Check("problem", "broker", str(error))
+        default = str(Settings.model_fields["broker_url"].default)
+        return overrides.settings(broker_url=default), lambda _settings: iter([finding])
 
 
 def guarded(part: Callable[[Settings], Iterator[Check]], settings: Settings) -> Iterator[Check]:

@@ -42,7 +42,8 @@ def command(
         bool, typer.Option("--queue", help="Plan here, and let workers do it: see semdb.workers.")
     ] = False,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Without PATH: send all that is planned and not done to the workers again.")
+        bool,
+        typer.Option("--resume", help="Send all that is planned and not done to the workers again."),
     ] = False,
     json: JsonFlag = False,
 ) -> None:
@@ -57,8 +58,12 @@ def command(
     settings = overrides.settings(batch=batch)
     if settings.log_format == "json":
         log_to()
-    if resume and not paths:
-        _resume(settings)
+    if resume:
+        if paths:
+            raise UsageError(
+                f"--resume is of all recordings and takes no PATH: leave out {paths[0]}, or leave out --resume"
+            )
+        _resume(settings, json=json)
         return
     if not paths:
         raise UsageError("name the folder of a recording: semdb ingest PATH (or --resume for what workers have left)")
@@ -89,13 +94,17 @@ def _send() -> Send:
     return cast("Send", workers.send_items)
 
 
-def _resume(settings: Settings) -> None:
+def _resume(settings: Settings, *, json: bool) -> None:
+    from semdb.cli.output import print_json
     from semdb.database.store import open_store
     from semdb.queueing import sweep
 
     with open_store(settings.database_url) as store:
         sent = sweep(store, _send(), all_pending=True)
-    print(f"sent {sent} keyframes to the workers" if sent else "nothing is left to send")
+    if json:
+        print_json({"sent": sent})
+    else:
+        print(f"sent {sent} keyframes to the workers" if sent else "nothing is left to send")
 
 
 def queued_text(summary: IngestSummary) -> str:

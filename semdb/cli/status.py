@@ -88,10 +88,10 @@ def show_rates(recordings: list[RecordingStatus], rates: Rates) -> None:
 
 
 def show_workers(store: Store, settings: Settings, *, everybody: bool) -> None:
-    """Print who is idle, where a broker is set to be asked, and with `everybody` who works on how much."""
+    """Print who works on how much, with `everybody`; where a broker is set also what waits unsent, and who is idle."""
     from importlib import import_module
 
-    from semdb.database.reporting import workers
+    from semdb.database.reporting import unsent, workers
     from semdb.errors import SemdbError
 
     busy = workers(store.engine)
@@ -100,6 +100,11 @@ def show_workers(store: Store, settings: Settings, *, everybody: bool) -> None:
         print(f"worker {worker.machine} process {worker.process}: {worker.items} keyframes in hand{late}")
     if "broker_url" not in settings.model_fields_set:
         return
+    if waiting := unsent(store.engine):
+        print(
+            f"{waiting} keyframes wait for which no message is known to be on its way: "
+            "where no semdb ingest is at them, semdb ingest --resume sends them"
+        )
     try:
         found = import_module("semdb.workers").nodes(settings)
     except (ImportError, SemdbError) as error:  # not installed, or the broker does not answer

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from sqlalchemy import Connection, Engine, FromClause, func, insert, select
+from sqlalchemy import Connection, Engine, FromClause, and_, func, insert, or_, select
 
 from semdb.database import retry
 from semdb.database.clock import now_plus
@@ -92,6 +93,41 @@ def workers(engine: Engine) -> list[WorkerStatus]:
         left = (_as_time(until) - _as_time(now)).total_seconds() if until is not None else 0.0
         found.append(WorkerStatus(parts[0], parts[2], int(count), left))
     return found
+
+
+@dataclass(frozen=True, slots=True)
+class OpenItem:
+    """A keyframe that is planned and not done. `held`: a worker has it whose lease has not run out."""
+
+    frame_index: int
+    attempts: int
+    held: bool
+
+
+def open_items(engine: Engine, recording_id: int, frames: Sequence[int]) -> list[OpenItem]:
+    """Those of `frames` that are neither stored, failed nor deleted, by index. Raises DatabaseError."""
+    item = ingest_items.c
+    held = and_(item.state == ItemState.RUNNING.value, item.lease_until >= now_plus())
+    query = (
+        select(item.frame_index, item.attempts, held)
+        .where(item.recording_id == recording_id, item.frame_index.in_(list(frames)))
+        .where(item.state.in_([ItemState.PENDING.value, ItemState.RUNNING.value]))
+        .order_by(item.frame_index)
+    )
+    rows = retry.read(engine, lambda c: list(c.execute(query)))
+    return [OpenItem(int(index), int(attempts), bool(is_held)) for index, attempts, is_held in rows]
+
+
+def unsent(engine: Engine) -> int:
+    """How many keyframes wait for which no message is known to be on its way: never sent, lost, or sent long ago."""
+    item = ingest_items.c
+    overdue = or_(item.lease_until.is_(None), item.lease_until < now_plus())
+    query = (
+        select(func.count())
+        .select_from(ingest_items.join(recordings, recordings.c.id == item.recording_id))
+        .where(item.state == ItemState.PENDING.value, overdue, recordings.c.state != RecordingState.DELETING.value)
+    )
+    return int(retry.read(engine, lambda c: c.execute(query).scalar()) or 0)
 
 
 def _as_time(value: Any) -> datetime:

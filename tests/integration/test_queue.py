@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import fsspec
 import pytest
 
 from semdb.cli.status import Rates
 from semdb.database import items
-from semdb.database.reporting import workers
+from semdb.database.reporting import OpenItem, open_items, workers
 from semdb.database.retry import MAY_HEAL, task_delay_s
 from semdb.database.store import Store, open_store
-from semdb.errors import RecordingError, RecordingUnavailableError, UsageError
+from semdb.errors import ProvenanceError, RecordingError, RecordingUnavailableError, UsageError
 from semdb.ingest import IngestOptions, ingest_recordings
-from semdb.queueing import CHUNK, Workplace, queue_recordings, sweep
+from semdb.queueing import CHUNK, Workplace, parts, queue_recordings, sweep
 from semdb.recordings.source import fetch, parse_source, write_source
 from semdb.settings import Settings
 from tests.integration.test_ingest import content
@@ -92,6 +94,85 @@ def test_a_lost_mount_is_waited_for_and_a_deleted_recording_is_not(room: Path, t
         assert place.do(*outbox[0]).stored == 6
         store.delete_recording(1)
     assert place.do(*outbox[0]).stored == 0
+
+
+def test_a_doubled_message_of_a_finished_recording_needs_no_folder(room: Path, tmp_path: Path) -> None:
+    url, mount = f"sqlite:///{tmp_path / 'a.sqlite3'}", tmp_path / "mount"
+    mount.symlink_to(room)
+    outbox, own = Outbox(), settings(url, tmp_path)
+    queue_recordings([str(mount)], own, IngestOptions(stride=4, map_name="m"), outbox.send)
+    assert Workplace(own).do(*outbox[0]).stored == 6
+    mount.unlink()
+    again = Workplace(own).do(*outbox[0])
+    assert (again.stored, again.left, again.held, again.complete, again.gone) == (0, (), (), True, False)
+    with open_store(url) as store:
+        store.delete_recording(1)
+    assert Workplace(own).do(*outbox[0]).gone
+
+
+def test_a_claim_whose_answer_was_lost_strands_nothing(
+    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The transaction is run again, and takes others than those that it has taken unknowingly."""
+    url = f"sqlite:///{tmp_path / 'a.sqlite3'}"
+    outbox, own = Outbox(), settings(url, tmp_path)
+    queue_recordings([str(room)], own, IngestOptions(stride=1, map_name="m"), outbox.send)
+    claim, unanswered = items.claim, []
+
+    def twice(*given: Any, **named: Any) -> list[items.Claim]:
+        if not unanswered:
+            unanswered.extend(claim(*given, **named))
+        return claim(*given, **named)
+
+    monkeypatch.setattr(items, "claim", twice)
+    outcome = Workplace(own).do(*outbox[0])
+    assert len(unanswered) >= 3
+    assert (outcome.stored, outcome.left, outcome.held) == (CHUNK, (), ())
+    with open_store(url) as store:
+        assert items.left(store.engine, 1) == (24 - CHUNK, 0)
+
+
+def test_what_another_worker_is_at_is_not_taken_for_done(room: Path, database_url: str, tmp_path: Path) -> None:
+    outbox, own = Outbox(), settings(database_url, tmp_path)
+    queue_recordings([str(room)], own, IngestOptions(stride=1, map_name="m"), outbox.send)
+    with open_store(database_url) as store:
+        items.claim(store.engine, 1, "elsewhere!1!2!3!a", limit=2)
+        outcome = Workplace(own).do(*outbox[0])
+        assert (outcome.stored, outcome.left, outcome.held) == (CHUNK - 2, (), (0, 1))
+        assert open_items(store.engine, 1, outbox[0][2]) == [OpenItem(0, 1, True), OpenItem(1, 1, True)]
+        items.renew(store.engine, 1, "elsewhere!1!2!3!a", lease_s=-5)
+        assert Workplace(own).do(*outbox[0]).stored == 2
+
+
+def test_what_was_begun_before_is_done_alone_and_last() -> None:
+    found = [OpenItem(1, 3, False), OpenItem(2, 0, False), OpenItem(3, 1, False), OpenItem(4, 0, False)]
+    assert parts([*found, OpenItem(5, 0, True)]) == [(2, 4), (3,), (1,)]
+    assert parts([OpenItem(5, 1, True)]) == []
+
+
+def test_a_worker_with_other_models_claims_nothing(room: Path, tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'a.sqlite3'}"
+    outbox, own = Outbox(), settings(url, tmp_path)
+    queue_recordings([str(room)], own, IngestOptions(stride=4, map_name="m"), outbox.send)
+    other = own.model_copy(update={"features": "sift"})
+    with pytest.raises(ProvenanceError, match="not by sift"):
+        Workplace(other).do(*outbox[0])
+    with open_store(url) as store:
+        assert [item.attempts for item in open_items(store.engine, 1, outbox[0][2])] == [0] * 6
+
+
+def test_keyframes_whose_message_was_not_sent_are_sent_by_the_next_sweep(room: Path, tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'a.sqlite3'}"
+    outbox, own = Outbox(), settings(url, tmp_path)
+
+    def refuse(*_: object) -> None:
+        raise OSError("the broker is gone")
+
+    with pytest.raises(OSError, match="gone"):
+        queue_recordings([str(room)], own, IngestOptions(stride=1, map_name="m"), refuse)
+    time.sleep(1.1)  # times of the database are whole seconds
+    with open_store(url) as store:
+        assert sweep(store, outbox.send) == 24
 
 
 def test_pauses_between_tasks_grow_up_to_a_limit() -> None:

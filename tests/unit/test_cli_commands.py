@@ -125,6 +125,10 @@ def test_watch_does_not_wait_for_what_is_being_deleted() -> None:
     assert "deleting" in output
 
 
+def test_resume_takes_no_path() -> None:
+    assert "--resume is of all recordings and takes no PATH" in run("ingest", "room", "--resume", code=2).stderr
+
+
 def test_retry_puts_failed_keyframes_back() -> None:
     from tests.database_samples import MODELS
 
