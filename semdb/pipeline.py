@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -35,9 +32,7 @@ def overlapped(items: Iterable[Any], stages: Sequence[Stage], window: int) -> It
     under_way: deque[Future[Any]] = deque()
     with ExitStack() as stack:
         pools = [
-            stack.enter_context(
-                ThreadPoolExecutor(stage.threads, f"semdb-{stage.name}", initializer=_let_others_finish_their_turn)
-            )
+            stack.enter_context(ThreadPoolExecutor(stage.threads, thread_name_prefix=f"semdb-{stage.name}"))
             for stage in stages
         ]
 
@@ -53,17 +48,6 @@ def overlapped(items: Iterable[Any], stages: Sequence[Stage], window: int) -> It
                 yield stop.result(under_way.popleft())
         while under_way:
             yield stop.result(under_way.popleft())
-
-
-def _let_others_finish_their_turn() -> None:
-    """Says that a thread that wakes need not push another off its core (SCHED_BATCH), where that can be said.
-
-    Stages have more threads than there are cores, and a network that is interrupted finds its weights gone from the
-    core's cache: without this an ingest on two cores takes 3 to 5 % longer.
-    """
-    if sys.platform == "linux":
-        with contextlib.suppress(OSError):  # a sandbox may forbid it
-            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
 class _Stop:
