@@ -97,18 +97,19 @@ class SharedIds:
                 found.update((name, row_id) for name, row_id in connection.execute(query))
             return found
 
-        def make(connection: Connection) -> None:
+        def find_or_make(connection: Connection) -> dict[str, int]:
             found = find(connection)
             for row in rows:
                 if row[key] not in found:
-                    connection.execute(insert(table), row)
+                    made = connection.execute(insert(table), row).inserted_primary_key
+                    if made is None:
+                        raise DatabaseError(f"the database gave no id for a new row of {table.name}")
+                    found[row[key]] = int(made[0])
+            return found
 
         for _ in range(10):  # another writer may make the same rows at the same time: then they are there
-            found = retry.read(self._engine, find)
-            if all(row[key] in found for row in rows):
-                return found
             try:
-                retry.write(self._engine, make)
+                return retry.write(self._engine, find_or_make)
             except IntegrityError:
                 continue
         raise DatabaseError(f"rows of {table.name} could not be made: other writers were always faster; try again")
