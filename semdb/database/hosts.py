@@ -83,11 +83,16 @@ class Failover:
 
 
 def _check_ready(connection: Any) -> None:
-    """Raises the driver's error for a node that is not part of its cluster now: it takes connections all the same."""
+    """Raises the driver's error for a node that is not part of its cluster now: it takes connections all the same.
+
+    A server that is none of a Galera cluster passes: MariaDB calls it not ready, too, but does not replicate by it.
+    """
     with connection.cursor() as cursor:
+        cursor.execute("SHOW GLOBAL VARIABLES LIKE 'wsrep_on'")
+        used = cursor.fetchone()
         cursor.execute("SHOW STATUS LIKE 'wsrep_ready'")
-        row = cursor.fetchone()
-    if row is not None and row[1] != "ON":
+        ready = cursor.fetchone()
+    if used is not None and used[1] == "ON" and ready is not None and ready[1] != "ON":
         connection.close()
         raise pymysql.err.OperationalError(NOT_READY, "the node is not part of its cluster")
 

@@ -23,11 +23,13 @@ from semdb.database.engine import WRITE, safe_url
 from semdb.errors import DatabaseError, DatabaseUnavailableError, RecordingUnavailableError
 
 T = TypeVar("T")
+_now = time.monotonic
 _answered: WeakSet[Engine] = WeakSet()  # engines that have had a connection
 listeners: list[Callable[[], None]] = []  # told of each transaction that is run again
 ATTEMPTS = 10
 FIRST_DELAY_S = 0.05
 LONGEST_DELAY_S = 3.0
+RESTART_S = 60.0  # so long a write waits for a server that has answered before, however often it was tried
 RETRIED_CODES = frozenset({1213, 1205, 2006, 2013, 1047, 1040, 1053})
 # What a task may meet and is worth repeating later.
 MAY_HEAL = (DatabaseUnavailableError, RecordingUnavailableError)
@@ -55,18 +57,11 @@ def write(engine: Engine, work: Callable[[Connection], T]) -> T:
 
 
 def _run(engine: Engine, work: Callable[[Connection], T], *, write: bool) -> T:
-    delay = FIRST_DELAY_S
-    for attempt in range(1, ATTEMPTS + 1):
+    delay, attempt, gone_since = FIRST_DELAY_S, 0, None
+    while True:
+        attempt += 1
         try:
-            with engine.connect().execution_options(**{WRITE: write}) as connection:
-                _answered.add(engine)
-                try:
-                    with connection.begin():
-                        return work(connection)
-                except DBAPIError as error:
-                    if error_code(error) in _NOT_READY:  # another node, or this one later, over a new connection
-                        connection.invalidate(error)
-                    raise
+            return _once(engine, work, write=write)
         except IntegrityError as error:
             if error_code(error) != 1213:  # a certification failure may be reported on any statement
                 raise
@@ -77,13 +72,26 @@ def _run(engine: Engine, work: Callable[[Connection], T], *, write: bool) -> T:
             failure = error
         except SQLAlchemyError as error:
             raise explain(engine, error) from error
-        if attempt == ATTEMPTS:
-            raise explain(engine, failure, attempts=ATTEMPTS) from failure
+        gone_since = (gone_since or _now()) if is_gone(failure) else None
+        patient = write and gone_since is not None and _now() - gone_since < RESTART_S
+        if attempt >= ATTEMPTS and not patient:
+            raise explain(engine, failure, attempts=attempt) from failure
         for listener in listeners:
             listener()
         time.sleep(delay * random.uniform(0.5, 1.0))
         delay = min(delay * 2, LONGEST_DELAY_S)
-    raise AssertionError("unreachable")
+
+
+def _once(engine: Engine, work: Callable[[Connection], T], *, write: bool) -> T:
+    with engine.connect().execution_options(**{WRITE: write}) as connection:
+        _answered.add(engine)
+        try:
+            with connection.begin():
+                return work(connection)
+        except DBAPIError as error:
+            if error_code(error) in _NOT_READY:  # another node, or this one later, over a new connection
+                connection.invalidate(error)
+            raise
 
 
 def task_delay_s(retries: int) -> float:
@@ -110,6 +118,13 @@ def is_transient(error: DBAPIError, *, answered: bool = True) -> bool:
     if code in RETRIED_CODES:
         return True
     return is_busy(error)
+
+
+def is_gone(error: Exception) -> bool:
+    """Whether the server is not there, or not ready: it may be starting, and read its log of changes again."""
+    code = error_code(error)
+    invalidated = isinstance(error, DBAPIError) and error.connection_invalidated and code in (None, 0)
+    return code in _UNREACHABLE | _LOST | _NOT_READY or invalidated
 
 
 def is_busy(error: Exception) -> bool:

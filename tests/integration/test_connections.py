@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
+from itertools import pairwise
 from pathlib import Path
 
 import pymysql
@@ -110,6 +111,48 @@ def test_repeating_ends(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(DatabaseError, match="failed 10 times in a row"):
         retry.write(store.engine, work)
     assert len(calls) == retry.ATTEMPTS == 10
+
+
+@pytest.mark.parametrize(("write", "code", "waits"), [(True, 2013, True), (False, 2013, False), (True, 1213, False)])
+def test_a_write_waits_for_a_server_that_starts_again(
+    store: Store, monkeypatch: pytest.MonkeyPatch, write: bool, code: int, waits: bool
+) -> None:
+    """For a minute, with pauses of at most 3 s; what only reads, or meets a server that is there, gives up before."""
+    clock = [1000.0]
+    monkeypatch.setattr(retry.time, "sleep", lambda seconds: clock.__setitem__(0, clock[0] + seconds))
+    monkeypatch.setattr(retry, "_now", lambda: clock[0])
+    store.maps()  # it has answered
+    calls: list[float] = []
+
+    def work(_: Connection) -> str:
+        calls.append(clock[0])
+        if clock[0] - 1000.0 < 50.0:
+            raise _lost(code)
+        return "done"
+
+    run = retry.write if write else retry.read
+    if waits:
+        assert run(store.engine, work) == "done"
+        assert 20 <= len(calls) <= 45
+        assert max(b - a for a, b in pairwise(calls)) <= 3.0
+        return
+    with pytest.raises(DatabaseError, match="failed 10 times in a row"):
+        run(store.engine, work)
+    assert len(calls) == 10
+
+
+def test_a_write_waits_a_minute_at_most(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [1000.0]
+    monkeypatch.setattr(retry.time, "sleep", lambda seconds: clock.__setitem__(0, clock[0] + seconds))
+    monkeypatch.setattr(retry, "_now", lambda: clock[0])
+    store.maps()
+
+    def work(_: Connection) -> None:
+        raise _lost(2013)
+
+    with pytest.raises(DatabaseError, match=r"failed \d\d times in a row"):
+        retry.write(store.engine, work)
+    assert 60.0 <= clock[0] - 1000.0 <= 64.0
 
 
 def test_a_refused_statement_is_not_repeated(store: Store) -> None:

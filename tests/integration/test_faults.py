@@ -130,6 +130,7 @@ def test_the_database_server_is_killed_and_started_again(long_room: Path, some: 
         with open_store(server.url()) as store:
             services.wait_until(lambda: stored(store) >= 10, "10 keyframes")
             server.kill()
+            time.sleep(12)  # a server that has much to recover is away longer than ten attempts take
             assert process.poll() is None
             server.start()
             _, errors = process.communicate(timeout=120)

@@ -55,9 +55,8 @@ def engine(two_servers: list[servers.Server]) -> Iterator[Engine]:
 
 
 @pytest.fixture
-def both(two_servers: list[servers.Server], monkeypatch: pytest.MonkeyPatch) -> Iterator[Engine]:
-    """Of the first server, and of the second when the first does not answer, as if they were a cluster."""
-    monkeypatch.setattr("semdb.database.hosts._check_ready", lambda _connection: None)
+def both(two_servers: list[servers.Server]) -> Iterator[Engine]:
+    """Of the first server, and of the second when the first does not answer; no cluster, so both are always ready."""
     one, other = two_servers
     made = make_engine(one.url().replace(f":{one.port}/", f":{one.port},127.0.0.1:{other.port}/"))
     yield made
