@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from typing import Any
 
 from sqlalchemy import Column, Connection, Engine, delete, insert, literal, select, update
 
@@ -109,21 +110,21 @@ def delete_map(engine: Engine, map_id: int, progress: Progress | None = None) ->
     query = select(recordings.c.id).where(recordings.c.map_id == map_id).order_by(recordings.c.id)
     recording_ids = retry.read(engine, lambda c: list(c.execute(query).scalars()))
     deleted = sum(delete_recording(engine, recording_id, progress).keyframes for recording_id in recording_ids)
-    for table in (keyframe_changes, queries):
-        _delete_rows(engine, table.c.map_id, map_id, table.c.id)
+    _delete_rows(engine, keyframe_changes.c.map_id, map_id, keyframe_changes.c.id)
+    _delete_rows(engine, queries.c.map_id, map_id, queries.c.created_at)
     retry.write(engine, lambda c: c.execute(delete(maps).where(maps.c.id == map_id)))
     return Deleted(recordings=len(recording_ids), keyframes=deleted)
 
 
-def _delete_rows(engine: Engine, owner: Column[int], owner_id: int, number: Column[int]) -> None:
-    """All rows of a table where `owner` is `owner_id`, in chunks by `number`, which is unique among them."""
+def _delete_rows(engine: Engine, owner: Column[int], owner_id: int, rank: Column[Any]) -> None:
+    """All rows of a table where `owner` is `owner_id`, in chunks by `rank`; an index begins with the two."""
 
     def work(connection: Connection) -> bool:
-        query = select(number).where(owner == owner_id).order_by(number).limit(SMALL_CHUNK)
-        numbers = list(connection.execute(query).scalars())
-        if numbers:
-            connection.execute(delete(owner.table).where(owner == owner_id, number <= numbers[-1]))
-        return bool(numbers)
+        query = select(rank).where(owner == owner_id).order_by(rank).limit(SMALL_CHUNK)
+        ranks = list(connection.execute(query).scalars())
+        if ranks:
+            connection.execute(delete(owner.table).where(owner == owner_id, rank <= ranks[-1]))
+        return bool(ranks)
 
     while retry.write(engine, work):
         pass

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Sequence
 
 import pytest
-from sqlalchemy import delete, select, text, update
+from sqlalchemy import delete, insert, select, text, update
 from sqlalchemy.exc import IntegrityError
 
 from semdb.database import tables
@@ -34,6 +34,24 @@ def test_a_deleted_recording_leaves_nothing_behind(store: Store) -> None:
     assert kinds[-20:] == [(key, ChangeKind.DELETED) for key in ids]
     # Ids are never used again: what a mirror or a log remembers stays true.
     assert min(fill(store, name="third visit")[2]) > max(ids)
+
+
+def test_a_deleted_map_takes_its_logs_along_in_chunks(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also those of one second, which are more than a chunk; another map keeps its own."""
+    monkeypatch.setattr("semdb.database.deletion.SMALL_CHUNK", 2)
+    maps = {name: fill(store, map_name=name)[0] for name in ("room", "hall")}
+    image = {"confidence": 0.0, "inliers": 0, "stage": "pose", "reason": "", "candidates": "[]", "timing_ms": "{}"}
+    with store.engine.begin() as connection:
+        rows = [
+            {"map_id": key, "image": f"{k}.png", "verdict": "lost", **image} for key in maps.values() for k in range(5)
+        ]
+        connection.execute(insert(tables.queries), rows)
+    store.delete_map(maps["room"])
+    with store.engine.connect() as connection:
+        for table in (tables.queries, tables.keyframe_changes, tables.recordings):
+            left = set(connection.execute(select(table.c.map_id)).scalars())
+            assert left == {maps["hall"]}, table.name
+    assert rows_per_table(store)["queries"] == 5
 
 
 def test_an_emptied_map_takes_other_models(store: Store) -> None:
