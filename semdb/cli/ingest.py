@@ -42,8 +42,7 @@ def command(
         bool, typer.Option("--queue", help="Plan here, and let workers do it: see semdb.workers.")
     ] = False,
     resume: Annotated[
-        bool,
-        typer.Option("--resume", help="Send all that is planned and not done to the workers again."),
+        bool, typer.Option("--resume", help="Send all that is planned and not done to the workers again.")
     ] = False,
     json: JsonFlag = False,
 ) -> None:
@@ -59,9 +58,18 @@ def command(
     if settings.log_format == "json":
         log_to()
     if resume:
-        if paths:
+        chosen = {
+            "PATH": paths,
+            "--map": map_name,
+            "--name": name,
+            "--keyframes": keyframes,
+            "--stride": stride,
+            "--camera": camera,
+        }
+        given = [word for word, value in chosen.items() if value not in (None, [])]
+        if given:
             raise UsageError(
-                f"--resume is of all recordings and takes no PATH: leave out {paths[0]}, or leave out --resume"
+                f"--resume is of all recordings and takes no {', '.join(given)}: leave that out, or leave out --resume"
             )
         _resume(settings, json=json)
         return

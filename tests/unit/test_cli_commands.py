@@ -127,6 +127,7 @@ def test_watch_does_not_wait_for_what_is_being_deleted() -> None:
 
 def test_resume_takes_no_path() -> None:
     assert "--resume is of all recordings and takes no PATH" in run("ingest", "room", "--resume", code=2).stderr
+    assert "takes no --map, --stride: leave" in run("ingest", "--map", "m", "--stride", "0", "--resume", code=2).stderr
 
 
 def test_retry_puts_failed_keyframes_back() -> None:
