@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from semdb.database import items
+from semdb.database.items import OpenItem, open_items
 from semdb.database.planning import StoredPlan, check_models, stored_plan
-from semdb.database.reporting import OpenItem, open_items
 from semdb.database.requeue import requeue_failed
 from semdb.database.store import Store, open_store
 from semdb.errors import NotFoundError, RecordingUnavailableError, UsageError

@@ -10,7 +10,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -105,11 +105,17 @@ class Worker:
 
 def start_worker(folder: Path, database_url: str, broker_url: str, *, processes: int = 1, **settings: str) -> Worker:
     """A worker with so many processes; its log is in `folder`. Returns at once."""
-    log = folder / f"worker-{time.monotonic_ns()}.log"
     command = [sys.executable, "-m", "celery", "--app", "semdb.workers", "worker", "--concurrency", str(processes)]
+    command += ["--loglevel", "info", "--without-gossip", "--without-mingle"]
+    return start(command, folder, database_url, broker_url, **settings)
+
+
+def start(command: Sequence[str], folder: Path, database_url: str, broker_url: str, **settings: str) -> Worker:
+    """A worker that is run by `command`; its log is in `folder`. Returns at once."""
+    log = folder / f"worker-{time.monotonic_ns()}.log"
     with log.open("wb") as file:
         process = subprocess.Popen(
-            [*command, "--loglevel", "info", "--without-gossip", "--without-mingle"],
+            command,
             env=environment(database_url, SEMDB_BROKER_URL=broker_url, **settings),
             stdout=file,
             stderr=subprocess.STDOUT,

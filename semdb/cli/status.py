@@ -91,7 +91,8 @@ def show_workers(store: Store, settings: Settings, *, everybody: bool) -> None:
     """Print who works on how much, with `everybody`; where a broker is set also what waits unsent, and who is idle."""
     from importlib import import_module
 
-    from semdb.database.reporting import unsent, workers
+    from semdb.database.items import unsent
+    from semdb.database.reporting import workers
     from semdb.errors import SemdbError
 
     busy = workers(store.engine)

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 from sqlalchemy import Connection, Engine, Table, insert, select
@@ -36,12 +37,21 @@ def digest(values: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
+def new_id(connection: Connection, table: Table, row: Mapping[str, Any]) -> int:
+    """Adds a row. Returns the id that the database gave it. Raises DatabaseError where it gives none."""
+    key = connection.execute(insert(table), row).inserted_primary_key
+    if key is None:
+        raise DatabaseError(f"the database gave no id for a new row of {table.name}")
+    return int(key[0])
+
+
 def model_row(info: ModelInfo) -> dict[str, Any]:
     row = {"role": info.role, "name": info.name, "sha256": info.sha256, "config": info.config}
     return {**row, "digest": digest(row)}
 
 
-def camera_row(camera: Camera) -> dict[str, Any]:
+@lru_cache(maxsize=64)  # every keyframe asks
+def camera_row(camera: Camera) -> Mapping[str, Any]:
     row: dict[str, Any] = {
         "model": camera.model,
         "width": int(camera.width),
@@ -58,11 +68,9 @@ class SharedIds:
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
         self._known: dict[tuple[str, str], int] = {}
-        self._cameras: dict[Camera, int] = {}
 
     def forget(self) -> None:
         self._known = {}
-        self._cameras = {}
 
     def models(self, infos: Iterable[ModelInfo]) -> dict[ModelInfo, int]:
         wanted = {info: model_row(info) for info in infos}
@@ -74,20 +82,17 @@ class SharedIds:
         return self._ensure(categories, "name", [{"name": name} for name in wanted])
 
     def camera(self, camera: Camera) -> int:
-        known = self._cameras.get(camera)
-        if known is None:
-            row = camera_row(camera)
-            known = self._cameras[camera] = self._ensure(cameras, "digest", [row])[row["digest"]]
-        return known
+        row = camera_row(camera)
+        return self._ensure(cameras, "digest", [row])[row["digest"]]
 
-    def _ensure(self, table: Table, key: str, rows: list[dict[str, Any]]) -> dict[str, int]:
+    def _ensure(self, table: Table, key: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, int]:
         missing = [row for row in rows if (table.name, row[key]) not in self._known]
         if missing:
             for row_key, row_id in self._make(table, key, missing).items():
                 self._known[table.name, row_key] = row_id
         return {row[key]: self._known[table.name, row[key]] for row in rows}
 
-    def _make(self, table: Table, key: str, rows: list[dict[str, Any]]) -> dict[str, int]:
+    def _make(self, table: Table, key: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, int]:
         def find(connection: Connection) -> dict[str, int]:
             keys = [row[key] for row in rows]
             found: dict[str, int] = {}
@@ -101,10 +106,7 @@ class SharedIds:
             found = find(connection)
             for row in rows:
                 if row[key] not in found:
-                    made = connection.execute(insert(table), row).inserted_primary_key
-                    if made is None:
-                        raise DatabaseError(f"the database gave no id for a new row of {table.name}")
-                    found[row[key]] = int(made[0])
+                    found[row[key]] = new_id(connection, table, row)
             return found
 
         for _ in range(10):  # another writer may make the same rows at the same time: then they are there

@@ -61,6 +61,15 @@ class QueuedItems:
     frame_indexes: tuple[int, ...]
 
 
+@dataclass(frozen=True, slots=True)
+class OpenItem:
+    """A keyframe that is planned and not done. `held`: a worker has it whose lease has not run out."""
+
+    frame_index: int
+    attempts: int
+    held: bool
+
+
 def worker_name() -> str:
     """A name that no other worker has; it tells the machine and the process: ``HOST!SPACE!PID!START!RANDOM``.
 
@@ -187,6 +196,35 @@ def left(engine: Engine, recording_id: int) -> tuple[int, int]:
     return counts.get(ItemState.PENDING.value, 0), counts.get(ItemState.RUNNING.value, 0)
 
 
+def open_items(engine: Engine, recording_id: int, frames: Sequence[int]) -> list[OpenItem]:
+    """Those of `frames` that are neither stored, failed nor deleted, by index. Raises DatabaseError."""
+    held = and_(_item.state == ItemState.RUNNING.value, _item.lease_until >= now_plus())
+    query = (
+        select(_item.frame_index, _item.attempts, held)
+        .where(_item.recording_id == recording_id, _item.frame_index.in_(list(frames)))
+        .where(_item.state.in_([ItemState.PENDING.value, ItemState.RUNNING.value]))
+        .order_by(_item.frame_index)
+    )
+    rows = retry.read(engine, lambda c: list(c.execute(query)))
+    return [OpenItem(int(index), int(attempts), bool(is_held)) for index, attempts, is_held in rows]
+
+
+def unsent(engine: Engine) -> int:
+    """How many keyframes wait for which no message is known to be on its way: never sent, lost, or sent long ago."""
+    query = select(func.count()).select_from(ingest_items.join(recordings, recordings.c.id == _item.recording_id))
+    query = query.where(_item.state == ItemState.PENDING.value, _not_on_its_way(), _not_being_deleted())
+    return int(retry.read(engine, lambda c: c.execute(query).scalar()) or 0)
+
+
+def _not_on_its_way() -> ColumnElement[bool]:
+    """Of a pending item (see `mark_sent`)."""
+    return or_(_item.lease_until.is_(None), _item.lease_until < now_plus())
+
+
+def _not_being_deleted() -> ColumnElement[bool]:
+    return recordings.c.state != RecordingState.DELETING.value
+
+
 def lost(engine: Engine, recording_id: int | None = None, *, all_pending: bool = False) -> list[QueuedItems]:
     """Keyframes that no living worker and no message is known to have, of one recording or of all.
 
@@ -198,14 +236,13 @@ def lost(engine: Engine, recording_id: int | None = None, *, all_pending: bool =
     expired = and_(mine, _item.state == ItemState.RUNNING.value, _item.lease_until < now_plus())
     due = and_(mine, _item.state == ItemState.PENDING.value)
     if not all_pending:
-        due = and_(due, or_(_item.lease_until.is_(None), _item.lease_until < now_plus()))
-    alive = recordings.c.state != RecordingState.DELETING.value
+        due = and_(due, _not_on_its_way())
 
     def work(connection: Connection) -> list[QueuedItems]:
         connection.execute(_given_up(and_(expired, _item.attempts >= MOST_ATTEMPTS)))
         connection.execute(update(ingest_items).where(expired).values(state=ItemState.PENDING.value, **_NOT_HELD))
         query = select(recordings.c.id, recordings.c.source, _item.frame_index)
-        query = query.join(recordings, recordings.c.id == _item.recording_id).where(due, alive)
+        query = query.join(recordings, recordings.c.id == _item.recording_id).where(due, _not_being_deleted())
         found: dict[tuple[int, str], list[int]] = {}
         for row in connection.execute(query.order_by(recordings.c.id, _item.frame_index)):
             found.setdefault((int(row.id), str(row.source)), []).append(int(row.frame_index))

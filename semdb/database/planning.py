@@ -10,7 +10,7 @@ from sqlalchemy import Connection, Engine, Row, func, insert, select, update
 from sqlalchemy.exc import IntegrityError
 
 from semdb.database import retry
-from semdb.database.ids import SharedIds, check_name
+from semdb.database.ids import SharedIds, check_name, new_id
 from semdb.database.records import (
     FailedItem,
     ItemState,
@@ -164,10 +164,7 @@ def _insert_plan(connection: Connection, map_id: int, plan: RecordingPlan) -> Pl
         "frame_count": plan.frame_count,
         "state": RecordingState.PLANNED.value,
     }
-    key = connection.execute(insert(recordings), values).inserted_primary_key
-    if key is None:
-        raise DatabaseError("the database gave no id for a new recording")
-    recording_id = int(key[0])
+    recording_id = new_id(connection, recordings, values)
     indexes = tuple(sorted(plan.frame_indexes))
     if indexes:
         item = {"recording_id": recording_id, "state": ItemState.PENDING.value, "attempts": 0}

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from sqlalchemy import Connection, Engine, FromClause, and_, func, insert, or_, select
+from sqlalchemy import Connection, Engine, FromClause, func, select
 
 from semdb.database import retry
 from semdb.database.clock import now_plus
+from semdb.database.ids import new_id
 from semdb.database.records import ItemState, RecordingState, RecordingStatus
 from semdb.database.tables import (
     ingest_items,
@@ -24,7 +24,6 @@ from semdb.database.tables import (
     recordings,
 )
 from semdb.database.writing import pose_columns
-from semdb.errors import DatabaseError
 from semdb.types import Localization
 
 
@@ -95,41 +94,6 @@ def workers(engine: Engine) -> list[WorkerStatus]:
     return found
 
 
-@dataclass(frozen=True, slots=True)
-class OpenItem:
-    """A keyframe that is planned and not done. `held`: a worker has it whose lease has not run out."""
-
-    frame_index: int
-    attempts: int
-    held: bool
-
-
-def open_items(engine: Engine, recording_id: int, frames: Sequence[int]) -> list[OpenItem]:
-    """Those of `frames` that are neither stored, failed nor deleted, by index. Raises DatabaseError."""
-    item = ingest_items.c
-    held = and_(item.state == ItemState.RUNNING.value, item.lease_until >= now_plus())
-    query = (
-        select(item.frame_index, item.attempts, held)
-        .where(item.recording_id == recording_id, item.frame_index.in_(list(frames)))
-        .where(item.state.in_([ItemState.PENDING.value, ItemState.RUNNING.value]))
-        .order_by(item.frame_index)
-    )
-    rows = retry.read(engine, lambda c: list(c.execute(query)))
-    return [OpenItem(int(index), int(attempts), bool(is_held)) for index, attempts, is_held in rows]
-
-
-def unsent(engine: Engine) -> int:
-    """How many keyframes wait for which no message is known to be on its way: never sent, lost, or sent long ago."""
-    item = ingest_items.c
-    overdue = or_(item.lease_until.is_(None), item.lease_until < now_plus())
-    query = (
-        select(func.count())
-        .select_from(ingest_items.join(recordings, recordings.c.id == item.recording_id))
-        .where(item.state == ItemState.PENDING.value, overdue, recordings.c.state != RecordingState.DELETING.value)
-    )
-    return int(retry.read(engine, lambda c: c.execute(query).scalar()) or 0)
-
-
 def _as_time(value: Any) -> datetime:
     """SQLite gives the text of a time that a function made."""
     return value if isinstance(value, datetime) else datetime.fromisoformat(str(value))
@@ -179,7 +143,4 @@ def log_query(engine: Engine, map_id: int, image: str, localization: Localizatio
         ),
         "timing_ms": json.dumps({name: round(float(ms), 3) for name, ms in localization.timing_ms.items()}),
     }
-    key = retry.write(engine, lambda c: c.execute(insert(queries), values).inserted_primary_key)
-    if key is None:
-        raise DatabaseError("the database gave no id for a row of queries")
-    return int(key[0])
+    return retry.write(engine, lambda connection: new_id(connection, queries, values))

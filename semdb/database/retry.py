@@ -65,14 +65,14 @@ def _run(engine: Engine, work: Callable[[Connection], T], *, write: bool) -> T:
         except IntegrityError as error:
             if error_code(error) != 1213:  # a certification failure may be reported on any statement
                 raise
-            failure: SQLAlchemyError = error
+            failure: DBAPIError = error
         except DBAPIError as error:
             if not is_transient(error, answered=engine in _answered):
                 raise explain(engine, error) from error
             failure = error
         except SQLAlchemyError as error:
             raise explain(engine, error) from error
-        gone_since = (gone_since or _now()) if is_gone(failure) else None
+        gone_since = (gone_since or _now()) if _may_be_starting(failure) else None
         patient = write and gone_since is not None and _now() - gone_since < RESTART_S
         if attempt >= ATTEMPTS and not patient:
             raise explain(engine, failure, attempts=attempt) from failure
@@ -110,21 +110,22 @@ def is_transient(error: DBAPIError, *, answered: bool = True) -> bool:
 
     A server that cannot be reached is a wrong URL when it has never `answered`, and else one that restarts.
     """
-    code = error_code(error)
-    if code in _UNREACHABLE or code in _LOST:
+    if _is_away(error):
         return answered
+    return error_code(error) in RETRIED_CODES or is_busy(error)
+
+
+def _may_be_starting(error: DBAPIError) -> bool:
+    """Whether the server is not there or not ready, as while it reads its log of changes again."""
+    return _is_away(error) or error_code(error) in _NOT_READY
+
+
+def _is_away(error: DBAPIError) -> bool:
+    """Whether nobody answers at the other end."""
+    code = error_code(error)
     if error.connection_invalidated and code in (None, 0):  # the driver's own word for a connection that is closed
-        return answered
-    if code in RETRIED_CODES:
         return True
-    return is_busy(error)
-
-
-def is_gone(error: Exception) -> bool:
-    """Whether the server is not there, or not ready: it may be starting, and read its log of changes again."""
-    code = error_code(error)
-    invalidated = isinstance(error, DBAPIError) and error.connection_invalidated and code in (None, 0)
-    return code in _UNREACHABLE | _LOST | _NOT_READY or invalidated
+    return code in _UNREACHABLE or code in _LOST
 
 
 def is_busy(error: Exception) -> bool:

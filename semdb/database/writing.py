@@ -15,7 +15,7 @@ from semdb.class_score import strengths
 from semdb.database import retry, tables
 from semdb.database.codecs import encode_array, encode_keypoints, encode_mask, image_format
 from semdb.database.engine import check_packet
-from semdb.database.ids import SharedIds
+from semdb.database.ids import SharedIds, new_id
 from semdb.database.items import Claim, held_by
 from semdb.database.planning import check_models, map_model_ids
 from semdb.database.records import ChangeKind, ItemState, KeyframeRecord, RecordingState, WriteResult
@@ -260,10 +260,7 @@ def _write(
             mine = claimed is not None and connection.execute(own).scalar() == claimed.token
             return WriteResult(int(keyframe_id), created=mine)
         _refuse(connection, recording_id, frame_index)
-    key = connection.execute(insert(tables.keyframes), {**rows.keyframe, "recording_id": recording_id})
-    if key.inserted_primary_key is None:
-        raise DatabaseError("the database gave no id for a new keyframe")
-    keyframe_id = int(key.inserted_primary_key[0])
+    keyframe_id = new_id(connection, tables.keyframes, {**rows.keyframe, "recording_id": recording_id})
     _write_children(connection, keyframe_id, rows)
     change = {"map_id": target.map_id, "keyframe_id": keyframe_id, "kind": ChangeKind.ADDED.value}
     connection.execute(insert(tables.keyframe_changes), change)

@@ -68,6 +68,17 @@ def content(store: Store) -> dict[str, list[tuple[Any, ...]]]:
     return {"frames": sorted((index, *sorted(kept, key=repr)) for index, kept in found.items()), "counts": counts}
 
 
+def stored(store: Store) -> int:
+    """How many keyframes there are."""
+    return rows_per_table(store)["keyframes"]
+
+
+def is_complete(store: Store) -> bool:
+    """Whether there are recordings, and nothing of them is left to do."""
+    found = store.status()
+    return bool(found) and all(str(recording.state) == "complete" for recording in found)
+
+
 def assert_same(stored: StoredKeyframe, described: Description, frame_index: int) -> None:
     assert stored.frame_index == frame_index
     assert stored.camera == described.camera

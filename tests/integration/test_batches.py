@@ -28,7 +28,7 @@ from semdb.recordings import open_recordings
 from semdb.recordings.base import FrameEntry, Recording
 from semdb.settings import Settings
 from semdb.types import Detection, Frame, ImageArray, ModelInfo
-from tests.integration.test_ingest import content
+from tests.integration.comparison import content
 from tests.integration.test_queue import Outbox
 
 STRIDE, KEYFRAMES = 3, (0, 3, 6, 9, 12, 15, 18, 21)

@@ -24,7 +24,7 @@ from semdb.ingest import IngestOptions, ingest_recordings
 from semdb.recordings.synthetic import SyntheticOptions
 from semdb.settings import Settings
 from tests import servers, services
-from tests.integration.comparison import content, rows_per_table
+from tests.integration.comparison import content, is_complete, rows_per_table, stored
 from tests.rooms import COMMAND, environment, render, semdb
 
 SPECS = {"SEMDB_DETECTOR": "recorded", "SEMDB_ENCODER": "gist", "SEMDB_FEATURES": "orb"}
@@ -73,14 +73,6 @@ def start_ingest(room: Path, url: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
         command, env=environment(url, **SPECS), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
-
-
-def stored(store: Store) -> int:
-    return rows_per_table(store)["keyframes"]
-
-
-def is_complete(store: Store) -> bool:
-    return all(str(recording.state) == "complete" for recording in store.status())
 
 
 def test_thirty_killed_workers(long_room: Path, undisturbed: Store, mariadb_url: str, tmp_path: Path) -> None:

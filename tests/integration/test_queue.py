@@ -12,7 +12,8 @@ import pytest
 
 from semdb.cli.status import Rates
 from semdb.database import items
-from semdb.database.reporting import OpenItem, open_items, workers
+from semdb.database.items import OpenItem, open_items
+from semdb.database.reporting import workers
 from semdb.database.retry import MAY_HEAL, task_delay_s
 from semdb.database.store import Store, open_store
 from semdb.errors import ProvenanceError, RecordingError, RecordingUnavailableError, UsageError
@@ -20,7 +21,7 @@ from semdb.ingest import IngestOptions, ingest_recordings
 from semdb.queueing import CHUNK, Workplace, parts, queue_recordings, sweep
 from semdb.recordings.source import fetch, parse_source, write_source
 from semdb.settings import Settings
-from tests.integration.test_ingest import content
+from tests.integration.comparison import content
 
 Message = tuple[int, str, tuple[int, ...]]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import socket
-import subprocess
 import sys
 import threading
 import time
@@ -15,7 +14,7 @@ import pytest
 from sqlalchemy import update
 
 from semdb.database import items
-from semdb.database.reporting import open_items, unsent
+from semdb.database.items import open_items, unsent
 from semdb.database.store import Store, open_store
 from semdb.database.tables import ingest_items
 from semdb.ingest import IngestOptions, ingest_recordings, make_describers
@@ -28,9 +27,9 @@ from semdb.recordings.synthetic import SyntheticOptions
 from semdb.settings import Settings
 from semdb.workers import INGEST_TASK, make_app
 from tests import services
-from tests.integration.test_ingest import content
+from tests.integration.comparison import content, is_complete, stored
 from tests.integration.test_queue import Outbox, settings
-from tests.rooms import environment, render, semdb
+from tests.rooms import render, semdb
 
 SPECS = {"SEMDB_DETECTOR": "recorded", "SEMDB_ENCODER": "gist", "SEMDB_FEATURES": "orb"}
 FRAMES = 20
@@ -82,24 +81,8 @@ def undisturbed(small: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
 
 def start(folder: Path, database_url: str, broker_url: str, change: str = "", **given: str) -> services.Worker:
     """A worker with one process, changed by a line of Python."""
-    log = folder / f"worker-{time.monotonic_ns()}.log"
-    with log.open("wb") as file:
-        process = subprocess.Popen(
-            [sys.executable, "-c", WORKER.format(change=change)],
-            env=environment(database_url, SEMDB_BROKER_URL=broker_url, **(SPECS | given)),
-            stdout=file,
-            stderr=subprocess.STDOUT,
-        )
-    return services.Worker(process, log)
-
-
-def is_complete(store: Store) -> bool:
-    found = store.status()
-    return bool(found) and all(str(recording.state) == "complete" for recording in found)
-
-
-def stored(store: Store) -> int:
-    return sum(recording.keyframes for recording in store.status())
+    command = [sys.executable, "-c", WORKER.format(change=change)]
+    return services.start(command, folder, database_url, broker_url, **(SPECS | given))
 
 
 def queue(room: Path, url: str, broker: services.Redis) -> None:

@@ -15,6 +15,17 @@ from typing import Any
 import numpy as np
 
 from semdb.compiled import kernel
+from semdb.perception.features._surf_levels import (
+    ALL_COLUMNS,
+    ALL_ROWS,
+    HALF,
+    LEFT,
+    MARGIN,
+    PART_COLUMNS,
+    PART_ROWS,
+    STEP,
+    TOP,
+)
 
 GRID = 20  # gradients across the descriptor window, each of size s
 CELLS = GRID + 1  # means of grey across it
@@ -329,10 +340,10 @@ def describe_levels(sums: Any, pitch: int, pad: int, parts: Any, edges: Any, bou
                     candidates: Any, angles: Any, extended: bool, weights: Any, descriptors: Any) -> None:  # fmt: skip
     """Descriptors of the candidates `order[bounds[k] : bounds[k + 1]]` from level k, for all k of the `level_parts`."""
     for k in range(len(parts)):
-        step, half, margin = parts[k, 0], parts[k, 1], parts[k, 2]
-        top, rows, left, across = parts[k, 3], parts[k, 4], parts[k, 5], parts[k, 6]
+        step, half, margin = parts[k, STEP], parts[k, HALF], parts[k, MARGIN]
+        top, rows, left, across = parts[k, TOP], parts[k, PART_ROWS], parts[k, LEFT], parts[k, PART_COLUMNS]
         smooth(sums, pitch, pad, step, half, edges[k], margin, top, rows, left, across, grey)
         describe(
-            grey, step, margin, top, parts[k, 7], left, parts[k, 8], across, candidates, angles,
+            grey, step, margin, top, parts[k, ALL_ROWS], left, parts[k, ALL_COLUMNS], across, candidates, angles,
             order[bounds[k] : bounds[k + 1]], extended, weights, descriptors,
         )  # fmt: skip

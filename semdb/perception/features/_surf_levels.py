@@ -62,7 +62,7 @@ def level_of(key: int, smoothing: float) -> Level:
 
 
 # Columns of `level_parts`.
-STEP, HALF, MARGIN, TOP, ROWS, LEFT, ACROSS, ALL_ROWS, ALL_COLUMNS = range(9)
+STEP, HALF, MARGIN, TOP, PART_ROWS, LEFT, PART_COLUMNS, ALL_ROWS, ALL_COLUMNS = range(9)
 
 
 def level_parts(

@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semdb.errors import UsageError
-from semdb.perception.features._surf_levels import ACROSS, ROWS, Level, level_keys, level_of, level_parts
+from semdb.perception.features._surf_levels import PART_COLUMNS, PART_ROWS, Level, level_keys, level_of, level_parts
 from semdb.types import BoolArray, Features, Float32Array, ImageArray, IntArray
 
 UPRIGHT_ANGLE = 270.0  # what OpenCV gives upright keypoints
@@ -266,7 +266,7 @@ class SURF:
         extents = candidates[order, :3]  # x, y, size
         low, high = np.minimum.reduceat(extents, starts), np.maximum.reduceat(extents, starts)
         parts, edges = level_parts(keys, low, high, (plane.height, plane.width), self.smoothing)
-        samples = parts[:, ROWS] * parts[:, ACROSS]
+        samples = parts[:, PART_ROWS] * parts[:, PART_COLUMNS]
 
         def run(first: int, last: int) -> None:
             grey = self._scratch.array("grey", (int(samples[first:last].max()),), np.float32)
