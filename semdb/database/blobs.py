@@ -18,6 +18,7 @@ from pymysql.cursors import Cursor
 
 KEPT = 32  # prepared statements of a connection; semdb has fewer that carry blobs
 _PREPARE, _EXECUTE = 0x16, 0x17
+_STATEMENT_OVERHEAD = 16  # bytes of a packet beside its statement, and to spare
 _BLOBS = (bytes, bytearray)
 _PLACEHOLDER = re.compile(r"%\(([^)]+)\)s|%s|%%")
 _DOUBLE, _NULL, _LONGLONG, _BLOB, _STRING = (struct.pack("<H", code) for code in (5, 6, 8, 252, 253))
@@ -46,6 +47,12 @@ class BlobCursor(Cursor):  # type: ignore[misc]
         ):
             return self._execute_prepared(query, args)
         return super().execute(query, args)
+
+    def executemany(self, query: Any, args: Any) -> Any:
+        """As PyMySQL's, which joins rows to statements of a megabyte; to no more than this server takes."""
+        limit = getattr(self._get_db(), "semdb_packet", Cursor.max_stmt_length)
+        self.max_stmt_length = min(Cursor.max_stmt_length, limit - _STATEMENT_OVERHEAD)
+        return super().executemany(query, args)
 
     def _execute_prepared(self, query: str, args: Mapping[str, Any] | Sequence[Any]) -> int:
         while self.nextset():

@@ -21,10 +21,21 @@ BUSY_TIMEOUT_MS = 30_000
 WRITE = "semdb_write"  # execution option of transactions that may be run again (`retry`): whether they write
 # Seconds: a machine that is gone is noticed after a minute, also where a statement may take any time.
 _KEEPALIVE = (("TCP_KEEPIDLE", 30), ("TCP_KEEPINTVL", 10), ("TCP_KEEPCNT", 3))
-_SERVER_SETTINGS = (
-    "SET SESSION time_zone = '+00:00'",
-    "SET SESSION sql_mode = 'STRICT_TRANS_TABLES,NO_ZERO_DATE,ERROR_FOR_DIVISION_BY_ZERO,NO_ENGINE_SUBSTITUTION'",
-)
+# What a server may have otherwise for all its connections, and what its statements and results depend on.
+_SERVER_SETTINGS = {
+    "time_zone": "'+00:00'",
+    "sql_mode": "'STRICT_TRANS_TABLES,NO_ZERO_DATE,ERROR_FOR_DIVISION_BY_ZERO,NO_ENGINE_SUBSTITUTION'",
+    "completion_type": "0",  # a connection goes on after COMMIT
+    "default_storage_engine": "InnoDB",
+    "foreign_key_checks": "1",  # deleting cascades
+    "group_concat_max_len": "1024",  # joined ids are cut off there (`semdb.database.scanning`)
+    "sql_auto_is_null": "0",
+    "sql_big_selects": "1",
+    "sql_quote_show_create": "1",
+    "sql_safe_updates": "0",
+    "sql_select_limit": "18446744073709551615",  # none
+    "unique_checks": "1",
+}
 
 
 def parse_url(url: str) -> URL:
@@ -117,7 +128,8 @@ def make_server_engine(url: URL, read_timeout_s: int | None = None) -> Engine:
             del parameters[name]  # what the dialect made of the URL's query
         return failover.connect(dialect, {**parameters, **tls_arguments(url)})
 
-    event.listen(engine, "connect", _configure_server)
+    # Before SQLAlchemy looks at the modes, for which it would quote names.
+    event.listen(engine, "connect", _configure_server, insert=True)
     _limit_waiting(engine, read_timeout_s)
     return engine
 
@@ -127,13 +139,12 @@ def _configure_server(connection: Any, record: Any) -> None:
         if hasattr(socket, name):  # not on every system
             connection._sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
     with connection.cursor() as cursor:
-        for statement in _SERVER_SETTINGS:
-            cursor.execute(statement)
+        cursor.execute("SET " + ", ".join(f"SESSION {name} = {value}" for name, value in _SERVER_SETTINGS.items()))
         cursor.execute("SHOW SESSION VARIABLES WHERE Variable_name IN ('wsrep_sync_wait', 'max_allowed_packet')")
         variables = dict(cursor.fetchall())
         if "wsrep_sync_wait" in variables:  # reads see what this cluster has committed
             cursor.execute("SET SESSION wsrep_sync_wait = 1")
-        record.info["max_allowed_packet"] = int(variables["max_allowed_packet"])
+        record.info["max_allowed_packet"] = connection.semdb_packet = int(variables["max_allowed_packet"])
 
 
 def _limit_waiting(engine: Engine, read_timeout_s: int | None) -> None:

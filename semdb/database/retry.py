@@ -41,6 +41,8 @@ _NO_ROOM = {3, 28, 1021, 1026, 1114}
 _UNREACHABLE = {2002, 2003, 2005}
 _LOST = {2006, 2013}
 _DENIED = {1044, 1045, 1049, 1698, 1142, 1227}
+_READ_ONLY = {1290, 1792, 1836}  # the server, the transactions that it begins, the schema
+_LARGE_PACKET = 1153
 _NO_TLS, _TLS_ONLY, _WRONG_ACCOUNT = 2026, 3159, 1045
 
 _NO_ROOM_ADVICE = "cannot grow: its disk, or the room that it was given, is full; make room and run the command again"
@@ -186,6 +188,10 @@ def _of_server(code: int | None, attempts: int, setting: str, *, answered: bool)
         return f"does not answer: check that the server runs and that host and port of {setting} are right"
     if code in _DENIED:
         return f"refuses: check user, password and schema of {setting}, and the account's rights"
+    if code in _READ_ONLY:
+        return f"takes no writes: give {setting} the server that does, or make this one writable"
+    if code == _LARGE_PACKET:
+        return "takes no statement that large: raise max_allowed_packet on the server"
     if code in _NO_ROOM:
         return _NO_ROOM_ADVICE
     if code in RETRIED_CODES:
