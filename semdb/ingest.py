@@ -24,6 +24,7 @@ from semdb.model_choice import ModelSpecs, settings_of_map, specs_for_ingest
 from semdb.perception.describe import Describer, describer_from_specs
 from semdb.recordings import open_recordings, parse_camera
 from semdb.recordings.base import DroppedFrame, FrameEntry, Recording
+from semdb.recordings.options import AS_THE_FORMAT_SAYS, ReadOptions
 from semdb.recordings.source import locate, write_source
 from semdb.settings import Settings
 from semdb.types import ModelInfo
@@ -37,8 +38,8 @@ SECONDS_BETWEEN_LOOKS = 0.5  # at what other workers still have
 class IngestOptions:
     """`keyframes` and `stride` as in `semdb.keyframes.select_keyframes`; `name` overrides the recording's own.
 
-    `map_name` None gives each recording the map of `default_map_name`. `camera` is the text of ``--camera``;
-    `descriptor_dtype` is how descriptors of float are stored.
+    `map_name` None gives each recording the map of `default_map_name`. `camera` is the text of ``--camera``,
+    `reading` says of the files what they do not say; `descriptor_dtype` is how descriptors of float are stored.
     """
 
     map_name: str | None = None
@@ -46,6 +47,7 @@ class IngestOptions:
     keyframes: int | None = None
     stride: int | None = None
     camera: str | None = None
+    reading: ReadOptions = AS_THE_FORMAT_SAYS
     descriptor_dtype: str = "float32"
 
     def map_of(self, recording: Recording) -> str:
@@ -120,9 +122,10 @@ def open_all(paths: Sequence[Path | str], settings: Settings, options: IngestOpt
     camera = None if options.camera is None else parse_camera(options.camera)
     recordings = []
     for path in paths:
-        for recording in open_recordings(locate(str(path), settings), camera):
+        for recording in open_recordings(locate(str(path), settings), camera, options.reading):
             below = recording.path.name if recording.path.name != Path(str(path)).name else None
-            recording.source = write_source(str(path) if below is None else f"{path}/{below}", options.camera)
+            address = str(path) if below is None else f"{path}/{below}"
+            recording.source = write_source(address, options.camera, options.reading)
             recordings.append(recording)
     if options.name is not None:
         if len(recordings) > 1:
@@ -254,6 +257,8 @@ def fingerprint(recording: Recording, keyframes: Sequence[FrameEntry]) -> str:
     digest = hashlib.sha256(f"{recording.format}|{recording.camera}|{recording.depth_scale}".encode())
     for entry in keyframes:
         digest.update(f"|{entry.index}|{entry.name}|{entry.timestamp_ns}".encode())
+        if entry.camera is not None:
+            digest.update(f"|{entry.camera}".encode())
         if entry.world_from_camera is not None:
             digest.update(entry.world_from_camera.astype("<f8").tobytes())
     return digest.hexdigest()

@@ -204,9 +204,9 @@ def _read(recording: Recording, item: Item) -> Item:
     try:
         item.frame = recording.read(item.entry)
     except FrameError as error:
-        if not recording.path.is_dir():
+        if not recording.path.exists():
             raise RecordingUnavailableError(
-                f"{recording.path}: the folder is not there any more; when it is mounted again, run the same again"
+                f"{recording.path}: the recording is not there any more; when it is mounted again, run the same again"
             ) from error
         item.error = str(error)
     item.seconds["read"] = time.perf_counter() - started

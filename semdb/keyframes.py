@@ -9,10 +9,12 @@ import numpy as np
 from semdb.errors import FrameError, RecordingError, UsageError
 from semdb.geometry import pose_distances
 from semdb.recordings.base import FrameEntry, Recording
-from semdb.types import FloatArray, IntArray
+from semdb.types import Camera, FloatArray, IntArray
 
 # Gives one keyframe in 9 frames of freiburg1_rpy (5 Hz) and one in 15 of 7-Scenes' red kitchen (7.5 Hz).
 MIN_OVERLAP = 0.7
+
+LIKE_CAMERA = 0.05  # of the focal length, by which cameras of frames may differ; depth is compared within 10 %
 
 Progress = Callable[[int, int], None]
 OverlapWith = Callable[[int, FloatArray], FloatArray]
@@ -86,6 +88,14 @@ def overlap_from_pose_distance(distance: FloatArray, min_overlap: float = MIN_OV
     return np.asarray(min_overlap**distance)
 
 
+def _alike(first: Camera, second: Camera) -> bool:
+    """Whether two cameras see so much the same that one stands for the other where views are compared."""
+    if (first.width, first.height) != (second.width, second.height):
+        return False
+    own, other = (np.array([c.fx, c.fy, c.cx, c.cy]) for c in (first, second))
+    return bool((np.abs(own - other) <= LIKE_CAMERA * other[0]).all())
+
+
 def _compare_views(
     recording: Recording, entries: Sequence[FrameEntry], progress: Progress | None
 ) -> tuple[list[FrameEntry], OverlapWith]:
@@ -93,11 +103,11 @@ def _compare_views(
     from semdb.view_overlap import ViewStack, view_grid
 
     readable, grids = [], []
-    camera = recording.camera
+    camera = recording.camera  # frames of quite another one are compared by their poses
     nothing = np.full((camera.height, camera.width), np.nan, dtype=np.float32)
     for done, entry in enumerate(entries, start=1):
         try:
-            depth = recording.read_depth(entry)
+            depth = recording.read_depth(entry) if _alike(recording.camera_of(entry), camera) else None
         except FrameError as error:
             recording.note_decode_failure(entry, error)
         else:

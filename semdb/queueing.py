@@ -205,17 +205,17 @@ class Workplace:
 
     def _recording(self, plan: StoredPlan, source: str) -> Recording:
         key = (plan.recording_id, source, plan.fingerprint)
-        if self._opened is not None and self._opened[0] == key and self._opened[1].path.is_dir():
+        if self._opened is not None and self._opened[0] == key and self._opened[1].path.exists():
             return self._opened[1]
         self._opened = None
-        address, camera = parse_source(source)
-        folder = locate(address, self._settings)
-        if not folder.is_dir():
+        found = parse_source(source)
+        folder = locate(found.address, self._settings)
+        if not folder.exists():
             raise RecordingUnavailableError(
-                f"{folder}: there is no such folder on this machine; workers must see recordings under the path, or "
-                "URL, that was given to `semdb ingest --queue`"
+                f"{folder}: no such folder or file on this machine; workers must see recordings under the path "
+                "or URL that was given to `semdb ingest --queue`"
             )
-        [recording] = open_recordings(folder, camera)
+        [recording] = open_recordings(folder, found.parsed_camera, found.options)
         known = {entry.index: entry for entry in recording.entries}
         entries = [known[index] for index in plan.frame_indexes if index in known]
         if len(entries) == len(plan.frame_indexes) and fingerprint(recording, entries) != plan.fingerprint:

@@ -14,6 +14,7 @@ from semdb.events import event
 from semdb.ingest import IngestOptions
 from semdb.item_work import log_item
 from semdb.queueing import Workplace, queue_recordings
+from semdb.recordings.options import read_options
 from semdb.recordings.source import is_address
 from semdb.settings import Settings
 
@@ -30,7 +31,7 @@ from . import (
     stopping,
 )
 
-OPTIONS: dict[str, type] = {"keyframes": int, "stride": int, "camera": str}  # of a whole recording
+OPTIONS: dict[str, type] = {"keyframes": int, "stride": int, "camera": str, "reading": str}  # of a whole recording
 PLAN_TRIES = 10  # of a recording that a worker refuses to plan: the next one may have the detector for it
 LIMITS = {"bind": True, "soft_time_limit": SOFT_LIMIT_S, "time_limit": HARD_LIMIT_S, "max_retries": None}
 _workplaces: list[Workplace] = []  # of this process, made by its first task
@@ -78,13 +79,15 @@ def ingest_recording(
 ) -> list[dict[str, Any]]:
     """Plan the recordings at `path`, which workers must see under that path, and send their keyframes to the workers.
 
-    `options`: ``keyframes`` and ``stride`` (int), ``camera`` (text as for ``--camera``). Returns what was planned of
+    `options`: ``keyframes`` and ``stride`` (int), ``camera`` (text as for ``--camera``), ``reading`` (text such as
+    ``depth_scale=1000&axes=ros``, see `semdb.recordings.options.ReadOptions`). Returns what was planned of
     each recording. What may heal, a path that is not there among it, is tried again with back-off. What this worker
     refuses is tried `PLAN_TRIES` times, then UsageError or RecordingError is raised, which Celery logs.
     """
     given = _checked(options or {})
     try:
-        planned = _plan(path, IngestOptions(map_name=map_name, name=name, **given))
+        reading = read_options(given.pop("reading", ""))
+        planned = _plan(path, IngestOptions(map_name=map_name, name=name, reading=reading, **given))
     except _StopsError as error:
         again.at_once(self, error, path=path)
     except (*retry.MAY_HEAL, SoftTimeLimitExceeded, BrokerError) as error:
@@ -120,8 +123,8 @@ def _plan(path: str, options: IngestOptions) -> list[dict[str, Any]]:
             raise _StopsError
 
     look("", 0, 0)
-    if not is_address(path) and not Path(path).is_dir():
-        raise RecordingUnavailableError(f"{path}: there is no such folder on this machine")
+    if not is_address(path) and not Path(path).exists():
+        raise RecordingUnavailableError(f"{path}: there is no such folder or file on this machine")
     summaries = queue_recordings([path], Settings(), options, send_items, progress=look)
     return [
         {

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from semdb.cli.options import CameraOption, Overrides, settings_options
+from semdb.cli.options import CameraOption, Overrides, Reading, reading_options, settings_options
 
 if TYPE_CHECKING:
     from semdb.evaluation.metrics import EvaluationResult
@@ -17,8 +17,10 @@ if TYPE_CHECKING:
 
 
 @settings_options(models=True)
+@reading_options()
 def command(
     overrides: Overrides,
+    reading: Reading,
     paths: Annotated[
         list[Path] | None,
         typer.Argument(metavar="[PATH...]", help="Folders of recordings; scenes of 7-Scenes for --protocol split."),
@@ -94,6 +96,7 @@ def command(
         max_queries=max_queries,
         coarse=coarse,
         camera=None if camera is None else parse_camera(camera),
+        reading=reading,
         query_depth=query_depth,
         protocol=protocol,
         map_from=tuple(map_from or ()),

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from semdb.cli.ending import ends_when_told
-from semdb.cli.options import CameraOption, JsonFlag, Overrides, settings_options
+from semdb.cli.options import CameraOption, JsonFlag, Overrides, Reading, reading_options, settings_options
 
 if TYPE_CHECKING:
     from semdb.ingest import IngestSummary
@@ -17,8 +17,10 @@ if TYPE_CHECKING:
 
 
 @settings_options(models=True)
+@reading_options()
 def command(
     overrides: Overrides,
+    reading: Reading,
     paths: Annotated[
         list[str] | None, typer.Argument(metavar="PATH...", help="Folders of recordings, or URLs such as s3://...")
     ] = None,
@@ -53,6 +55,7 @@ def command(
     from semdb.events import log_to
     from semdb.ingest import IngestOptions, ingest_recordings
     from semdb.queueing import queue_recordings
+    from semdb.recordings.options import option_of
 
     settings = overrides.settings(batch=batch)
     if settings.log_format == "json":
@@ -65,6 +68,7 @@ def command(
             "--keyframes": keyframes,
             "--stride": stride,
             "--camera": camera,
+            **{option_of(name): value for name, value in reading.given().items()},
         }
         given = [word for word, value in chosen.items() if value not in (None, [])]
         if given:
@@ -75,7 +79,9 @@ def command(
         return
     if not paths:
         raise UsageError("name the folder of a recording: semdb ingest PATH (or --resume for what workers have left)")
-    options = IngestOptions(map_name=map_name, name=name, keyframes=keyframes, stride=stride, camera=camera)
+    options = IngestOptions(
+        map_name=map_name, name=name, keyframes=keyframes, stride=stride, camera=camera, reading=reading
+    )
     with StagedProgress() as progress, ends_when_told():
         if queue:
             summaries = queue_recordings(paths, settings, options, _send(), progress=progress.update, say=say)

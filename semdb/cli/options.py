@@ -6,14 +6,19 @@ import functools
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, cast
 
 import typer
 
 from semdb.errors import UsageError
 
 if TYPE_CHECKING:
+    from semdb.recordings.options import ReadOptions
     from semdb.settings import Settings
+
+    Reading: TypeAlias = ReadOptions
+else:
+    Reading = Any  # `reading_options` puts options in its place, so typer never sees it
 
 _PANEL = "Settings"
 
@@ -63,6 +68,27 @@ CameraOption = Annotated[
         help="Intrinsics in pixels and lens distortion, instead of those known for the data set.",
     ),
 ]
+_READING_PANEL = "How the recording is to be read"
+
+
+def _reading(option: str, metavar: str, text: str) -> Any:
+    kind = float if metavar in ("N", "MS") else str
+    return Annotated[kind | None, typer.Option(option, metavar=metavar, help=text, rich_help_panel=_READING_PANEL)]
+
+
+_READING = {
+    "depth_scale": _reading("--depth-scale", "N", "Units per metre of depth files."),
+    "poses_are": _reading("--poses-are", "WHAT", "world_from_camera (default) or camera_from_world."),
+    "axes": _reading("--axes", "NAME", "Axes of the camera that the poses are of: opencv, opengl, arkit or ros."),
+    "quaternion": _reading("--quaternion", "ORDER", "Order of the numbers of quaternions: xyzw or wxyz."),
+    "time_offset_ms": _reading("--time-offset-ms", "MS", "Added to the times of poses to get those of colour."),
+    "depth_offset_ms": _reading("--depth-offset-ms", "MS", "Added to the times of depth to get those of colour."),
+    "scale": _reading("--scale", "N", "Metres per unit of poses, where the format has none."),
+    "color_topic": _reading("--color-topic", "TOPIC", "Colour images of a ROS bag."),
+    "depth_topic": _reading("--depth-topic", "TOPIC", "Depth images of a ROS bag."),
+    "info_topic": _reading("--info-topic", "TOPIC", "camera_info of the colour camera of a ROS bag."),
+    "world_frame": _reading("--world-frame", "FRAME", "World frame of a ROS bag's poses."),
+}
 JsonFlag = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on stdout.")]
 
 
@@ -125,19 +151,36 @@ def settings_options(*, models: bool) -> Callable[[Callable[..., None]], Callabl
 
     `models` False gives ``--database-url``; True adds those of ``_MODELS``: detector, encoder, …
     """
-    options = _MODELS if models else _DATABASE
+    return _options_instead_of("overrides", _MODELS if models else _DATABASE, lambda given: Overrides(**given))
+
+
+def reading_options() -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Decorator: the parameter ``reading: ReadOptions`` of a command becomes the options of `ReadOptions`."""
+
+    def make(given: dict[str, Any]) -> Any:
+        from semdb.recordings.options import ReadOptions
+
+        return ReadOptions(**{name: value for name, value in given.items() if value is not None})
+
+    return _options_instead_of("reading", _READING, make)
+
+
+def _options_instead_of(
+    replaced: str, options: dict[str, Any], make: Callable[[dict[str, Any]], Any]
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Decorator: the parameter `replaced` becomes `options`, of whose values `make` makes it."""
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
         signature = inspect.signature(function, eval_str=True)
-        kept = [parameter for name, parameter in signature.parameters.items() if name != "overrides"]
+        kept = [parameter for name, parameter in signature.parameters.items() if name != replaced]
         added = [
             inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
             for name, annotation in options.items()
         ]
 
         def call(**arguments: Any) -> None:
-            overrides = Overrides(**{name: arguments.pop(name) for name in options})
-            function(**arguments, overrides=overrides)
+            given = {name: arguments.pop(name) for name in options}
+            function(**arguments, **{replaced: make(given)})
 
         # typer reads a command's options from its signature
         new = signature.replace(parameters=[p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in kept] + added)

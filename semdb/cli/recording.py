@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from semdb.cli.options import CameraOption, JsonFlag
+from semdb.cli.options import CameraOption, JsonFlag, Reading, reading_options
 
 if TYPE_CHECKING:
     from semdb.recordings import DroppedFrame, Recording
@@ -18,8 +18,10 @@ if TYPE_CHECKING:
 NAMES_SHOWN = 3
 
 
+@reading_options()
 def command(
-    path: Annotated[Path, typer.Argument(help="Folder of a recording, or of a scene with several.")],
+    path: Annotated[Path, typer.Argument(help="Folder or file of a recording, or folder of a scene with several.")],
+    reading: Reading,
     camera: CameraOption = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="Do not decode every image; look at headers and file ends only.")
@@ -33,7 +35,7 @@ def command(
     from semdb.cli.output import print_json
     from semdb.recordings import open_recordings, parse_camera
 
-    recordings = open_recordings(path, None if camera is None else parse_camera(camera))
+    recordings = open_recordings(path, None if camera is None else parse_camera(camera), reading)
     if not quick:
         for recording in recordings:
             decode_all(recording)

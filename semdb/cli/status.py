@@ -219,11 +219,15 @@ def retry(overrides: Overrides, map_name: MapName = None) -> None:
 
 
 def ingest_again(recording: RecordingStatus) -> str:
-    """The command that goes on with a recording: under its own name, in its own map, with its own camera."""
+    """The command that goes on with a recording: under its own name, in its own map, read as it was."""
     import shlex
 
-    from semdb.recordings.source import split_source
+    from semdb.recordings.options import option_of
+    from semdb.recordings.source import parse_source
 
-    where, camera = split_source(recording.source)
-    words = ["semdb", "ingest", where, "--map", recording.map, "--name", recording.name]
-    return shlex.join(words if camera is None else [*words, "--camera", camera])
+    source = parse_source(recording.source)
+    words = ["semdb", "ingest", source.address, "--map", recording.map, "--name", recording.name]
+    said = [] if source.camera is None else ["--camera", source.camera]
+    for name, value in source.options.given().items():
+        said += [option_of(name), value]
+    return shlex.join([*words, *said])

@@ -20,6 +20,7 @@ from semdb.evaluation.worst import PackedDetection, Shown, draw_worst
 from semdb.localize import check_coarse
 from semdb.model_choice import specs_for_ingest
 from semdb.recordings.base import Recording
+from semdb.recordings.options import AS_THE_FORMAT_SAYS, ReadOptions
 from semdb.settings import Settings
 from semdb.types import Camera
 
@@ -44,6 +45,7 @@ class EvaluateOptions:
     max_queries: int | None = None
     coarse: str = "sql"
     camera: Camera | None = None
+    reading: ReadOptions = AS_THE_FORMAT_SAYS
     query_depth: bool = False
     protocol: str = PAPER
     map_from: tuple[Path, ...] = ()
@@ -136,13 +138,13 @@ def check_options(paths: Sequence[Path], options: EvaluateOptions) -> list[Metho
 
 def _openings(paths: Sequence[Path], options: EvaluateOptions) -> list[tuple[str, Callable[[], list[Plan]]]]:
     """What is to be opened, by name; opening may fail for each."""
-    camera = options.camera
+    camera, reading = options.camera, options.reading
     if options.map_from or options.query_from:
         name = ", ".join(str(path) for path in (*options.map_from, *options.query_from))
-        return [(name, lambda: [folder_plan(options.map_from, options.query_from, camera)])]
+        return [(name, lambda: [folder_plan(options.map_from, options.query_from, camera, options.reading)])]
     if options.protocol == PAPER:
-        return [(str(path), lambda path=path: paper_plans(path, camera)) for path in paths]  # type: ignore[misc]
-    return [(str(path), lambda path=path: [scene_plan(path, camera)]) for path in paths]  # type: ignore[misc]
+        return [(str(path), lambda path=path: paper_plans(path, camera, reading)) for path in paths]  # type: ignore[misc]
+    return [(str(path), lambda path=path: [scene_plan(path, camera, reading)]) for path in paths]  # type: ignore[misc]
 
 
 def _evaluate_plan(

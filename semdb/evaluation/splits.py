@@ -12,18 +12,19 @@ from semdb.errors import RecordingError, UsageError
 from semdb.evaluation.tasks import PaperPlan, Plan, SplitPlan
 from semdb.recordings import open_recordings
 from semdb.recordings.base import Recording
+from semdb.recordings.options import ReadOptions
 from semdb.types import Camera
 
 TRAIN_FILE, TEST_FILE = "TrainSplit.txt", "TestSplit.txt"
 _LINE = re.compile(r"(?:sequence|seq)[-_ ]?0*(\d+)", re.IGNORECASE)
 
 
-def paper_plans(path: Path, camera: Camera | None = None) -> list[Plan]:
+def paper_plans(path: Path, camera: Camera | None = None, reading: ReadOptions | None = None) -> list[Plan]:
     """Protocol `paper`: one plan per recording under `path`. Raises RecordingError."""
-    return [PaperPlan(recording) for recording in open_recordings(path, camera)]
+    return [PaperPlan(recording) for recording in open_recordings(path, camera, reading)]
 
 
-def scene_plan(path: Path, camera: Camera | None = None) -> SplitPlan:
+def scene_plan(path: Path, camera: Camera | None = None, reading: ReadOptions | None = None) -> SplitPlan:
     """Protocol `split` of a 7-Scenes scene: map from the sequences of TrainSplit.txt, queries from TestSplit.txt.
 
     Raises UsageError where the two files are missing, RecordingError that names the line of a sequence that is not
@@ -40,7 +41,7 @@ def scene_plan(path: Path, camera: Camera | None = None) -> SplitPlan:
     if both:
         raise RecordingError(f"{path}: sequence{min(both)} is in {TRAIN_FILE} and in {TEST_FILE}")
     halves = [
-        tuple(_sequence(path, name, number, camera) for number in numbers)
+        tuple(_sequence(path, name, number, camera, reading) for number in numbers)
         for name, numbers in zip((TRAIN_FILE, TEST_FILE), chosen, strict=True)
     ]
     return SplitPlan(path.resolve().name, halves[0], halves[1])
@@ -61,9 +62,17 @@ def split_lines(path: Path) -> list[int]:
     return list(dict.fromkeys(numbers))
 
 
-def folder_plan(map_from: Sequence[Path], query_from: Sequence[Path], camera: Camera | None = None) -> SplitPlan:
+def folder_plan(
+    map_from: Sequence[Path],
+    query_from: Sequence[Path],
+    camera: Camera | None = None,
+    reading: ReadOptions | None = None,
+) -> SplitPlan:
     """Protocol `split` of recordings in one world frame that the caller names. Raises UsageError, RecordingError."""
-    halves = [[found for path in paths for found in open_recordings(path, camera)] for paths in (map_from, query_from)]
+    halves = [
+        [found for path in paths for found in open_recordings(path, camera, reading)]
+        for paths in (map_from, query_from)
+    ]
     same = {found.path.resolve() for found in halves[0]} & {found.path.resolve() for found in halves[1]}
     if same:
         raise UsageError(
@@ -75,10 +84,10 @@ def folder_plan(map_from: Sequence[Path], query_from: Sequence[Path], camera: Ca
     return SplitPlan(names, tuple(halves[0]), tuple(halves[1]))
 
 
-def _sequence(path: Path, name: str, number: int, camera: Camera | None) -> Recording:
+def _sequence(path: Path, name: str, number: int, camera: Camera | None, reading: ReadOptions | None) -> Recording:
     for folder in (f"seq-{number:02d}", f"seq-{number}", f"seq{number:02d}", f"seq{number}"):
         if (path / folder).is_dir():
-            [recording] = open_recordings(path / folder, camera)
+            [recording] = open_recordings(path / folder, camera, reading)
             return recording
     raise RecordingError(f"{path / name}: names sequence{number}, but there is no folder {path / f'seq-{number:02d}'}")
 

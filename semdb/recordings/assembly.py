@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from semdb.errors import FrameError, RecordingError
-from semdb.recordings.base import DroppedFrame, FrameEntry, Recording, depth_size
+from semdb.recordings.base import DroppedFrame, FrameData, FrameEntry, Recording, depth_size
 from semdb.recordings.cameras import with_size
 from semdb.recordings.images import ImageHeader, inspect_file
 from semdb.types import Camera
@@ -29,32 +29,53 @@ class Draft:
     categories: Mapping[int, str] | None = None
     known_camera: Camera | None = None  # of the data set; an explicit camera wins over it
     depth_scale: float = 5000.0
+    data: FrameData | None = None  # where images are no files of their own
 
 
 def finish(draft: Draft, camera: Camera | None) -> Recording:
     """Checks headers and ends of all files and makes the `Recording`. `camera` given by the user wins.
 
+    Where entries have cameras of their own, `camera` takes the place of each. Images that are no files of their own
+    are not looked at: `known_camera` or `camera` must have their size.
     Raises RecordingError when no frame is left, or the images do not have the size of the camera.
     """
+    if draft.data is not None:
+        return _finish_data(draft, camera)
     headers, unreadable = _inspect_images(draft.entries)
     draft.dropped += unreadable
     if not headers:
         raise no_usable_frame(draft)
     chosen = _choose_camera(draft, camera, [header for _, header in headers])
     usable = []
-    for entry, header in headers:
-        reason = _problem(entry, header, chosen, depth_size(chosen, draft.depth_registration))
+    for found, header in headers:
+        entry = found if camera is None else replace(found, camera=None)
+        own = entry.camera or chosen
+        reason = _problem(entry, header, own, depth_size(own, draft.depth_registration))
         if reason:
             draft.dropped.append(DroppedFrame(entry.name, reason))
         else:
             usable.append(entry)
+    return _recording(draft, usable, chosen)
+
+
+def _finish_data(draft: Draft, camera: Camera | None) -> Recording:
+    chosen = draft.known_camera
+    if camera is not None:
+        chosen = camera if chosen is None else with_size(camera, (chosen.width, chosen.height))
+        draft.entries = [replace(entry, camera=None) for entry in draft.entries]
+    if chosen is None or not (chosen.width and chosen.height):
+        raise unknown_camera(draft.path)
+    return _recording(draft, draft.entries, chosen)
+
+
+def _recording(draft: Draft, usable: Sequence[FrameEntry], camera: Camera) -> Recording:
     if not usable:
         raise no_usable_frame(draft)
     return Recording(
         path=draft.path,
         name=draft.name,
         format=draft.format,
-        camera=chosen,
+        camera=camera,
         depth_scale=draft.depth_scale,
         total_frames=draft.total_frames,
         entries=tuple(sorted(usable, key=lambda entry: entry.index)),
@@ -62,7 +83,13 @@ def finish(draft: Draft, camera: Camera | None) -> Recording:
         notes=tuple(draft.notes),
         depth_registration=draft.depth_registration if any(entry.depth_path for entry in usable) else "",
         categories=draft.categories,
+        data=draft.data,
     )
+
+
+def unknown_camera(path: Path) -> RecordingError:
+    """The error for a recording that says nothing of its camera."""
+    return RecordingError(f"{path}: the camera is not known; give --camera fx,fy,cx,cy")
 
 
 def no_usable_frame(draft: Draft) -> RecordingError:
@@ -89,10 +116,12 @@ def _inspect_images(
 
 def _choose_camera(draft: Draft, camera: Camera | None, headers: Sequence[ImageHeader]) -> Camera:
     size, count = Counter(header.size for header in headers).most_common(1)[0]
-    chosen = camera or draft.known_camera
+    chosen = camera or draft.known_camera or _usual_camera(draft.entries)
     if chosen is None:
-        raise RecordingError(f"{draft.path}: the camera is not known; give --camera fx,fy,cx,cy")
+        raise unknown_camera(draft.path)
     chosen = with_size(chosen, size)
+    if draft.known_camera is None and camera is None:
+        return chosen  # each frame has its own
     if (chosen.width, chosen.height) == size or any(h.size == (chosen.width, chosen.height) for h in headers):
         return chosen
     origin = "the given camera" if camera else "the camera of this recording"
@@ -100,6 +129,12 @@ def _choose_camera(draft: Draft, camera: Camera | None, headers: Sequence[ImageH
         f"{draft.path}: {count} of {len(headers)} images have {size[0]}x{size[1]} pixels, none the "
         f"{chosen.width}x{chosen.height} of {origin}; give the intrinsics of these images with --camera fx,fy,cx,cy"
     )
+
+
+def _usual_camera(entries: Sequence[FrameEntry]) -> Camera | None:
+    """The camera that most frames have; None where they name none."""
+    cameras = Counter(entry.camera for entry in entries if entry.camera is not None)
+    return cameras.most_common(1)[0][0] if cameras else None
 
 
 def _problem(entry: FrameEntry, header: ImageHeader, camera: Camera, depth: tuple[int, int]) -> str | None:

@@ -11,7 +11,15 @@ import numpy as np
 import numpy.typing as npt
 
 from semdb.errors import RecordingError
-from semdb.geometry import pose_from, rotation_from_quat_wxyz, slerp_wxyz, so3_log
+from semdb.geometry import (
+    pose_from,
+    quat_wxyz_from_rotation,
+    rotation_from_quat_wxyz,
+    rotations_from_quats_wxyz,
+    slerp_wxyz,
+    so3_log,
+)
+from semdb.recordings.options import ReadOptions
 from semdb.types import FloatArray
 
 MAX_TIME_DIFFERENCE_NS = 20_000_000
@@ -87,8 +95,11 @@ def read_file_list(path: Path) -> tuple[list[TimedFile], list[BadLine]]:
     return files, bad
 
 
-def parse_pose(values: Sequence[str]) -> tuple[FloatArray, FloatArray]:
-    """Unit quaternion wxyz and translation of seven texts ``tx ty tz qx qy qz qw``. Raises ValueError."""
+def parse_pose(values: Sequence[str], quaternion: str | None = None) -> tuple[FloatArray, FloatArray]:
+    """Unit quaternion wxyz and translation of seven texts ``tx ty tz qx qy qz qw``. Raises ValueError.
+
+    `quaternion` "wxyz" says that the last four are qw qx qy qz instead.
+    """
     if len(values) != 7:
         raise ValueError(f"needs tx ty tz qx qy qz qw, but has {len(values)} numbers")
     try:
@@ -97,26 +108,27 @@ def parse_pose(values: Sequence[str]) -> tuple[FloatArray, FloatArray]:
         raise ValueError("has something that is no number") from error
     if not np.isfinite(numbers).all():
         raise ValueError("has a number that is not finite")
-    x, y, z, w = numbers[3:]
-    quat_wxyz = np.array([w, x, y, z])
+    quat_wxyz = numbers[3:] if quaternion == "wxyz" else numbers[[6, 3, 4, 5]]
     norm = float(np.linalg.norm(quat_wxyz))
     if abs(norm - 1) > NORM_TOLERANCE:
         raise ValueError(f"is no rotation: the quaternion has length {norm:.3g} instead of 1")
     return quat_wxyz / norm, numbers[:3]
 
 
-def read_trajectory(path: Path) -> tuple[Trajectory, list[str]]:
+def read_trajectory(path: Path, options: ReadOptions | None = None) -> tuple[Trajectory, list[str]]:
     """Poses of a TUM trajectory (``time tx ty tz qx qy qz qw``) sorted by time, and notes on what was not right.
 
-    Lines that cannot be used are left out and noted; of equal times the first is kept.
+    Lines that cannot be used are left out and noted; of equal times the first is kept. `options` say what the poses
+    are of; what is returned are ``world_from_camera`` at the times of colour.
     Raises RecordingError when no line can be used.
     """
+    options = options or ReadOptions()
     samples: list[tuple[int, FloatArray, FloatArray]] = []
     bad: list[BadLine] = []
     for number, line in read_lines(path):
         values = line.split()
         try:
-            samples.append((parse_time_ns(values[0]), *parse_pose(values[1:])))
+            samples.append((parse_time_ns(values[0]), *parse_pose(values[1:], options.quaternion)))
         except ValueError as error:
             bad.append(BadLine(number, str(error)))
     if not samples:
@@ -134,7 +146,18 @@ def read_trajectory(path: Path) -> tuple[Trajectory, list[str]]:
     trajectory = Trajectory(
         times[keep], np.stack([samples[i][1] for i in keep]), np.stack([samples[i][2] for i in keep])
     )
-    return trajectory, notes
+    return corrected(trajectory, options), notes
+
+
+def corrected(trajectory: Trajectory, options: ReadOptions) -> Trajectory:
+    """The trajectory as `options` say it is to be understood: its times, its direction, its axes."""
+    times = trajectory.time_ns + round(options.time_offset_ms * 1e6)
+    if not options.changes_poses:
+        return Trajectory(times, trajectory.quat_wxyz, trajectory.translation)
+    rotations = rotations_from_quats_wxyz(trajectory.quat_wxyz)
+    poses = [options.pose(pose_from(*sample)) for sample in zip(rotations, trajectory.translation, strict=True)]
+    quats = np.stack([quat_wxyz_from_rotation(pose[:3, :3]) for pose in poses])
+    return Trajectory(times, quats, np.stack([pose[:3, 3] for pose in poses]))
 
 
 def bad_lines_note(file_name: str, bad: Sequence[BadLine], what: str) -> str:

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from semdb.errors import FrameError
 from semdb.recordings.cameras import SEVEN_SCENES_DEPTH
-from semdb.recordings.images import decode_16bit, decode_color, decode_depth, read_bytes
+from semdb.recordings.images import (
+    decode_16bit,
+    decode_color,
+    decode_depth,
+    encode_16bit,
+    encode_color,
+    read_bytes,
+    scaled_depth,
+)
+from semdb.recordings.options import ReadOptions
 from semdb.types import Camera, Float32Array, FloatArray, Frame, ImageArray, InstanceMasks
 
 REGISTRATION_7SCENES = "7scenes"
@@ -23,7 +34,8 @@ class FrameEntry:
     `index` is stable: 7-Scenes the number in the file name, the other layouts the position (from 0) in the colour
     list sorted by time; it does not depend on which other frames can be used. `world_from_camera` ``[4, 4]`` is
     the colour camera's pose, rotation in SO(3). `turn_rate` ``[3]`` is how the camera turns meanwhile, in radians a
-    second in its own frame, where the trajectory is finer than the frames.
+    second in its own frame, where the trajectory is finer than the frames. Paths are those of the files that hold
+    the images, which may hold those of other frames too. `camera` is this frame's own, where frames differ in it.
     """
 
     index: int
@@ -34,6 +46,37 @@ class FrameEntry:
     masks_path: Path | None
     world_from_camera: FloatArray | None
     turn_rate: FloatArray | None = None
+    camera: Camera | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RawDepth:
+    """Depth ``[H, W]`` uint16 registered to the colour image; 0 and 65535 are invalid, `scale` units are a metre.
+
+    `png` is the same as a file, where there is one.
+    """
+
+    values: npt.NDArray[np.uint16]
+    scale: float
+    png: bytes | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RawColor:
+    """A colour image as a PNG or JPEG `file`, or as `pixels` ``[H, W, 3]`` RGB uint8 where it was none."""
+
+    file: bytes | None = None
+    pixels: ImageArray | None = None
+
+
+class FrameData(Protocol):
+    """Images that are no files of their own: in bags, archives, databases and videos. Several threads may read."""
+
+    def color(self, entry: FrameEntry) -> RawColor:
+        """The colour image. Raises FrameError."""
+
+    def depth(self, entry: FrameEntry) -> RawDepth | None:
+        """The depth, registered to the colour image; None where there is none. Raises FrameError."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,49 +129,57 @@ class Recording:
     depth_registration: str = ""
     categories: Mapping[int, str] | None = None
     source: str = ""  # what the database keeps of where it came from; "": the folder
+    data: FrameData | None = None  # where images are no files of their own
     decode_failures: list[DroppedFrame] = field(default_factory=list)
+
+    def camera_of(self, entry: FrameEntry) -> Camera:
+        """The camera of a frame: its own where frames differ in it."""
+        return entry.camera or self.camera
 
     def read(self, entry: FrameEntry) -> Frame:
         """Decodes one frame. Raises FrameError that names the file."""
-        image_bytes = read_bytes(entry.image_path)
-        image = decode_color(image_bytes, str(entry.image_path))
-        if image.shape[:2] != (self.camera.height, self.camera.width):
+        image, file = self._color(entry)
+        camera = self.camera_of(entry)
+        if image.shape[:2] != (camera.height, camera.width):
             raise FrameError(
-                f"{entry.image_path}: {image.shape[1]}x{image.shape[0]} pixels, but the camera has "
-                f"{self.camera.width}x{self.camera.height}"
+                f"{self.name_of(entry)}: {image.shape[1]}x{image.shape[0]} pixels, but the camera has "
+                f"{camera.width}x{camera.height}"
             )
-        depth_bytes = None if entry.depth_path is None else read_bytes(entry.depth_path)
+        depth, depth_bytes, scale = self._depth(entry, with_bytes=True)
         return Frame(
             index=entry.index,
             name=entry.name,
             timestamp_ns=entry.timestamp_ns,
             image=image,
-            depth=None if depth_bytes is None else self._decode_depth(depth_bytes, entry),
-            camera=self.camera,
+            depth=depth,
+            camera=camera,
             world_from_camera=entry.world_from_camera,
             instances=self.read_instances(entry),
-            image_bytes=image_bytes,
+            image_bytes=encode_color(image) if file is None else file,
             depth_bytes=depth_bytes,
-            depth_scale=None if depth_bytes is None else self.depth_scale,
-            depth_registration="" if depth_bytes is None else self.depth_registration,
+            depth_scale=scale,
+            depth_registration="" if depth is None else self.depth_registration,
         )
 
     def read_image(self, entry: FrameEntry) -> ImageArray:
         """Only the colour image ``[H, W, 3]``. Raises FrameError that names the file."""
-        return decode_color(read_bytes(entry.image_path), str(entry.image_path))
+        return self._color(entry)[0]
 
     def read_depth(self, entry: FrameEntry) -> Float32Array | None:
         """Only the registered depth ``[H, W]`` metres; None where there is none. Raises FrameError."""
-        if entry.depth_path is None:
-            return None
-        return self._decode_depth(read_bytes(entry.depth_path), entry)
+        return self._depth(entry, with_bytes=False)[0]
+
+    def name_of(self, entry: FrameEntry) -> str:
+        """The image of a frame, for messages."""
+        return str(entry.image_path) if self.data is None else f"{self.path}: {entry.name}"
 
     def read_instances(self, entry: FrameEntry) -> InstanceMasks | None:
         """Only the object masks; None where there are none. Raises FrameError that names the file."""
         if entry.masks_path is None or self.categories is None:
             return None
         name = str(entry.masks_path)
-        size = (self.camera.width, self.camera.height)
+        camera = self.camera_of(entry)
+        size = (camera.width, camera.height)
         labels = decode_16bit(read_bytes(entry.masks_path), name, size, "an image of masks")
         unknown = sorted(set(np.unique(labels).tolist()) - {0} - set(self.categories))
         if unknown:
@@ -158,7 +209,47 @@ class Recording:
         positions = np.stack([pose[:3, 3] for pose in poses])
         return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
 
-    def _decode_depth(self, data: bytes, entry: FrameEntry) -> Float32Array:
-        size = depth_size(self.camera, self.depth_registration)
-        depth = decode_depth(data, str(entry.depth_path), self.depth_scale, size)
-        return register_depth(depth, self.depth_registration, self.camera)
+    def _color(self, entry: FrameEntry) -> tuple[ImageArray, bytes | None]:
+        """Pixels, and the file where there is one."""
+        if self.data is None:
+            file = read_bytes(entry.image_path)
+            return decode_color(file, self.name_of(entry)), file
+        raw = self.data.color(entry)
+        if raw.pixels is not None:
+            return raw.pixels, raw.file
+        file = raw.file or b""
+        return decode_color(file, self.name_of(entry)), file
+
+    def _depth(self, entry: FrameEntry, *, with_bytes: bool) -> tuple[Float32Array | None, bytes | None, float | None]:
+        """Registered depth, its file and the file's scale; None where there is none."""
+        if entry.depth_path is None:
+            return None, None, None
+        camera = self.camera_of(entry)
+        if self.data is None:
+            data = read_bytes(entry.depth_path)
+            size = depth_size(camera, self.depth_registration)
+            depth = decode_depth(data, str(entry.depth_path), self.depth_scale, size)
+            return register_depth(depth, self.depth_registration, camera), data, self.depth_scale
+        raw = self.data.depth(entry)
+        if raw is None:
+            return None, None, None
+        if raw.values.shape != (camera.height, camera.width):
+            height, width = raw.values.shape
+            raise FrameError(f"{self.name_of(entry)}: depth of {width}x{height} pixels, but colour has another size")
+        file = (raw.png or encode_16bit(raw.values)) if with_bytes else None
+        return scaled_depth(raw.values, raw.scale), file, raw.scale
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """One kind of recording: how it is recognised and opened. Each has a file of its own in this package.
+
+    `about` says for people what it looks like, `takes` names the fields of `ReadOptions` that can mean something to
+    it. `open` gives one recording, or several where the folder holds them.
+    """
+
+    name: str
+    about: str
+    matches: Callable[[Path], bool]
+    open: Callable[[Path, Camera | None, ReadOptions], list[Recording]]
+    takes: frozenset[str] = frozenset()

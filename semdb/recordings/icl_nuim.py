@@ -18,8 +18,9 @@ from semdb.errors import RecordingError
 from semdb.geometry import pose_from, rotation_from_quat_wxyz
 from semdb.recordings.assembly import Draft, finish
 from semdb.recordings.association import BadLine, bad_lines_note, parse_pose, read_lines
-from semdb.recordings.base import DroppedFrame, FrameEntry, Recording
+from semdb.recordings.base import DroppedFrame, FrameEntry, Layout, Recording
 from semdb.recordings.cameras import ICL_NUIM, TUM_DEPTH_SCALE
+from semdb.recordings.options import ReadOptions
 from semdb.types import Camera, FloatArray
 
 ASSOCIATIONS = "associations.txt"
@@ -29,16 +30,19 @@ FLIP_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 
 def is_icl_nuim(path: Path) -> bool:
     """Whether a folder has ICL-NUIM's poses, or its associations without TUM's lists."""
-    return any(path.glob(POSES)) or ((path / ASSOCIATIONS).is_file() and not (path / "rgb.txt").is_file())
+    return path.is_dir() and (
+        any(path.glob(POSES)) or ((path / ASSOCIATIONS).is_file() and not (path / "rgb.txt").is_file())
+    )
 
 
-def open_icl_nuim(path: Path, camera: Camera | None = None) -> Recording:
+def open_icl_nuim(path: Path, camera: Camera | None = None, options: ReadOptions | None = None) -> Recording:
     """A recording with ``rgb/N.png``, ``depth/N.png``, ``associations.txt`` and one ``*.gt.freiburg``.
 
     Frames have no times (`timestamp_ns` None): the format numbers them. Frames without a pose (the data set has
     none for frame 0) are dropped. Without ``associations.txt`` the images are paired by number.
     Raises RecordingError.
     """
+    options = options or ReadOptions()
     rows, dropped = _read_associations(path) if (path / ASSOCIATIONS).is_file() else _list_images(path)
     draft = Draft(
         path=path,
@@ -48,11 +52,11 @@ def open_icl_nuim(path: Path, camera: Camera | None = None) -> Recording:
         entries=[],
         dropped=dropped,
         known_camera=ICL_NUIM,
-        depth_scale=TUM_DEPTH_SCALE,
+        depth_scale=options.depth_scale or TUM_DEPTH_SCALE,
     )
     if [row[0] for row in rows] != sorted(row[0] for row in rows):
         draft.notes.append(f"{ASSOCIATIONS}: frame numbers are not in ascending order; sorted")
-    poses = _read_poses(path, draft.notes)
+    poses = _read_poses(path, draft.notes, options)
     used: dict[int, str] = {}
     for index, (number, depth_name, colour_name) in enumerate(sorted(rows, key=lambda row: row[0])):
         if number in used:
@@ -98,7 +102,7 @@ def _list_images(path: Path) -> tuple[list[tuple[int, str, str]], list[DroppedFr
     return [(number, f"depth/{name}", f"rgb/{name}") for number, name in colour], []
 
 
-def _read_poses(path: Path, notes: list[str]) -> dict[int, FloatArray] | None:
+def _read_poses(path: Path, notes: list[str], options: ReadOptions) -> dict[int, FloatArray] | None:
     files = sorted(path.glob(POSES))
     if not files:
         notes.append(f"no {POSES}: the frames have no pose and cannot become keyframes")
@@ -114,13 +118,14 @@ def _read_poses(path: Path, notes: list[str]) -> dict[int, FloatArray] | None:
         try:
             if not re.fullmatch(r"\d+(\.0*)?", values[0]):
                 raise ValueError(f"{values[0][:40]!r} is no frame number")
-            quat_wxyz, translation = parse_pose(values[1:])
+            quat_wxyz, translation = parse_pose(values[1:], options.quaternion)
         except ValueError as error:
             bad.append(BadLine(line_number, str(error)))
             continue
         number = int(values[0].split(".")[0])
         repeated += number in poses
-        poses.setdefault(number, pose_from_icl(pose_from(rotation_from_quat_wxyz(quat_wxyz), translation)))
+        pose = options.pose(pose_from(rotation_from_quat_wxyz(quat_wxyz), translation))
+        poses.setdefault(number, pose_from_icl(pose))
     if not poses:
         where = f", line {bad[0].line}: {bad[0].reason}" if bad else ": has no pose"
         raise RecordingError(f"{files[0]}{where}; lines of 'N tx ty tz qx qy qz qw' are needed")
@@ -129,3 +134,12 @@ def _read_poses(path: Path, notes: list[str]) -> dict[int, FloatArray] | None:
     if repeated:
         notes.append(f"{files[0].name}: {repeated} repeated frame number(s); the first pose of each is kept")
     return poses
+
+
+LAYOUT = Layout(
+    "icl_nuim",
+    "ICL-NUIM (associations.txt, *.gt.freiburg)",
+    is_icl_nuim,
+    lambda path, camera, options: [open_icl_nuim(path, camera, options)],
+    frozenset({"depth_scale", "poses_are", "axes", "quaternion"}),
+)

@@ -208,12 +208,34 @@ def decode_depth(data: bytes, name: str, depth_scale: float, size: tuple[int, in
     `depth_scale` is units per metre, `size` the expected (width, height), `name` for messages. The values 0 (no
     measurement) and 65535 (7-Scenes' mark, and saturation everywhere) are invalid. Raises FrameError.
     """
+    return scaled_depth(decode_16bit(data, name, size), depth_scale)
+
+
+def scaled_depth(raw: npt.NDArray[np.uint16], depth_scale: float) -> Float32Array:
+    """Depth ``[H, W]`` float32 metres of 16-bit values of `depth_scale` a metre; NaN for 0 and 65535."""
     from semdb.recordings._png_rows import scaled
 
-    raw = decode_16bit(data, name, size)
     depth = np.empty(raw.shape, np.float32)
     scaled(raw, np.float32(1.0 / depth_scale), depth)
     return depth
+
+
+def encode_16bit(values: npt.NDArray[np.uint16]) -> bytes:
+    """A PNG file of 16-bit values ``[H, W]``; `decode_16bit` gives them back."""
+    return _encode(".png", np.ascontiguousarray(values), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+
+
+def encode_color(image: ImageArray) -> bytes:
+    """A PNG file of RGB ``[H, W, 3]`` or grey ``[H, W]`` uint8; `decode_color` gives it back."""
+    pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    return _encode(".png", np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+
+
+def _encode(kind: str, pixels: npt.NDArray[Any], parameters: list[int]) -> bytes:
+    done, data = cv2.imencode(kind, pixels, parameters)
+    if not done:
+        raise FrameError(f"an image of {pixels.shape[1]}x{pixels.shape[0]} pixels cannot be written as {kind}")
+    return bytes(data)
 
 
 def read_bytes(path: Path) -> bytes:

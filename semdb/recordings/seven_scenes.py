@@ -15,8 +15,9 @@ import numpy as np
 from semdb.errors import RecordingError
 from semdb.geometry import invert_pose, pose_from, project_to_so3
 from semdb.recordings.assembly import Draft, finish, no_usable_frame
-from semdb.recordings.base import REGISTRATION_7SCENES, DroppedFrame, FrameEntry, Recording
+from semdb.recordings.base import REGISTRATION_7SCENES, DroppedFrame, FrameEntry, Layout, Recording
 from semdb.recordings.cameras import SEVEN_SCENES_COLOR, SEVEN_SCENES_DEPTH_SCALE
+from semdb.recordings.options import ReadOptions
 from semdb.types import Camera, FloatArray
 
 FRAME_FILE = re.compile(r"frame-(\d+)\.(color\.png|color\.jpg|color\.jpeg|depth\.png|pose\.txt)")
@@ -53,13 +54,14 @@ def sequence_name(path: Path) -> str:
     return f"{folder.parent.name}-{folder.name}" if SEQUENCE.fullmatch(folder.name) else folder.name
 
 
-def open_seven_scenes(path: Path, camera: Camera | None = None) -> Recording:
+def open_seven_scenes(path: Path, camera: Camera | None = None, options: ReadOptions | None = None) -> Recording:
     """One sequence of 7-Scenes. `camera`, when given, is the colour camera; the depth camera stays the known one.
 
     Frames have no times (`timestamp_ns` None). Frames without colour, depth or pose, or with a pose that is no
     rigid motion, are dropped; where no frame at all has depth (or a pose), all are kept without (noted).
     Raises RecordingError.
     """
+    options = options or ReadOptions()
     files = _list_frames(path)
     draft = Draft(
         path=path,
@@ -70,7 +72,7 @@ def open_seven_scenes(path: Path, camera: Camera | None = None) -> Recording:
         dropped=[],
         depth_registration=REGISTRATION_7SCENES,
         known_camera=SEVEN_SCENES_COLOR,
-        depth_scale=SEVEN_SCENES_DEPTH_SCALE,
+        depth_scale=options.depth_scale or SEVEN_SCENES_DEPTH_SCALE,
     )
     has_depth = any("depth" in parts for parts in files.values())
     has_poses = any("pose" in parts for parts in files.values())
@@ -79,7 +81,7 @@ def open_seven_scenes(path: Path, camera: Camera | None = None) -> Recording:
     if not has_poses:
         draft.notes.append("no frame-*.pose.txt: the frames have no pose and cannot become keyframes")
     for number, parts in sorted(files.items()):
-        entry = _entry(path, number, parts, has_depth, has_poses)
+        entry = _entry(path, number, parts, has_depth, has_poses, options)
         if isinstance(entry, DroppedFrame):
             draft.dropped.append(entry)
         else:
@@ -128,7 +130,7 @@ def _list_frames(path: Path) -> dict[int, dict[str, str]]:
 
 
 def _entry(
-    path: Path, number: int, parts: dict[str, str], has_depth: bool, has_poses: bool
+    path: Path, number: int, parts: dict[str, str], has_depth: bool, has_poses: bool, options: ReadOptions
 ) -> FrameEntry | DroppedFrame:
     name = parts.get("color") or f"frame-{number:06d}"
     if "color" not in parts:
@@ -140,8 +142,22 @@ def _entry(
         if "pose" not in parts:
             return DroppedFrame(name, "no pose.txt")
         try:
-            pose = read_pose(path / parts["pose"]) @ DEPTH_FROM_COLOR
+            pose = options.pose(read_pose(path / parts["pose"])) @ DEPTH_FROM_COLOR
         except ValueError as error:
             return DroppedFrame(name, f"{parts['pose']}: {error}")
     depth_path = path / parts["depth"] if "depth" in parts else None
     return FrameEntry(number, name, None, path / parts["color"], depth_path, None, pose)
+
+
+def _open(path: Path, camera: Camera | None, options: ReadOptions) -> list[Recording]:
+    sequences = [path] if is_seven_scenes(path) else find_sequences(path)
+    return [open_seven_scenes(sequence, camera, options) for sequence in sequences]
+
+
+LAYOUT = Layout(
+    "seven_scenes",
+    "7-Scenes (frame-XXXXXX.color.png, or folders seq-XX of them)",
+    lambda path: path.is_dir() and (is_seven_scenes(path) or bool(find_sequences(path))),
+    _open,
+    frozenset({"depth_scale", "poses_are", "axes"}),
+)

@@ -11,17 +11,19 @@ import os
 import re
 import secrets
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from semdb.errors import RecordingError, RecordingUnavailableError, UsageError
 from semdb.recordings.cameras import parse_camera
 from semdb.recordings.credentials import refuse_credentials
+from semdb.recordings.options import AS_THE_FORMAT_SAYS, ReadOptions, read_options, write_options
 from semdb.settings import Settings
 from semdb.types import Camera
 
 _ADDRESS = re.compile(r"[a-z][a-z0-9+.-]*://")
-_CAMERA = "?camera="
+_SAID = re.compile(rf"\?(?:camera|{'|'.join(field.name for field in fields(ReadOptions))})=")  # in a source
 FETCHERS = 8  # files that are fetched at a time
 
 
@@ -30,26 +32,42 @@ def is_address(path: str) -> bool:
     return _ADDRESS.match(path) is not None
 
 
-def write_source(address: str, camera: str | None) -> str:
-    """What the database keeps: the absolute folder or the URL, and the camera where one was given by hand.
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Where a recording is, and what was said by hand about how it is to be read: what it takes to open it again."""
+
+    address: str  # folder, file or URL
+    camera: str | None = None  # the text of --camera
+    options: ReadOptions = AS_THE_FORMAT_SAYS
+
+    @property
+    def parsed_camera(self) -> Camera | None:
+        """The camera that was given by hand."""
+        return None if self.camera is None else parse_camera(self.camera)
+
+
+def write_source(address: str, camera: str | None, options: ReadOptions | None = None) -> str:
+    """What the database keeps: the absolute path or the URL, and the camera and the options that were given by hand.
 
     Raises UsageError for a URL with a password.
     """
     refuse_credentials(address)
     where = address if is_address(address) else str(Path(address).absolute())
-    return where if camera is None else f"{where}{_CAMERA}{camera}"
+    said = [] if camera is None else [f"camera={camera}"]
+    if written := write_options(options or ReadOptions()):
+        said.append(written)
+    return f"{where}?{'&'.join(said)}" if said else where
 
 
-def parse_source(source: str) -> tuple[str, Camera | None]:
-    """The folder or URL, and the camera, of `write_source`."""
-    where, camera = split_source(source)
-    return where, None if camera is None else parse_camera(camera)
-
-
-def split_source(source: str) -> tuple[str, str | None]:
-    """The folder or URL, and the camera as it was given by hand, of `write_source`."""
-    where, found, camera = source.partition(_CAMERA)
-    return where, camera if found else None
+def parse_source(source: str) -> Source:
+    """What `write_source` wrote."""
+    found = _SAID.search(source)
+    if found is None:
+        return Source(source)
+    said, camera = source[found.start() + 1 :], None
+    if said.startswith("camera="):
+        camera, _, said = said.removeprefix("camera=").partition("&")
+    return Source(source[: found.start()], camera, read_options(said))
 
 
 def locate(address: str, settings: Settings) -> Path:
@@ -65,7 +83,7 @@ def locate(address: str, settings: Settings) -> Path:
 
 
 def fetch(address: str, cache: Path) -> Path:
-    """Copies all files under the URL `address` into a folder of `cache`, which it returns; see `locate`."""
+    """Copies all files under the URL `address`, or that file, into `cache`. Returns where it is; see `locate`."""
     system, root = _file_system(address)
     try:
         listing = system.find(root, detail=True)
@@ -80,7 +98,8 @@ def fetch(address: str, cache: Path) -> Path:
     prefix = str(root).rstrip("/") + "/"
     wanted = []
     for remote, info in listing.items():
-        relative = str(remote).removeprefix(prefix)
+        # a single file becomes one of that name
+        relative = "" if str(remote) == prefix.rstrip("/") else str(remote).removeprefix(prefix)
         target = folder / relative
         if not target.resolve().is_relative_to(folder.resolve()):
             raise RecordingError(f"{address}: has a file of the impossible name {relative!r}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +21,9 @@ from semdb.recordings.association import (
     read_trajectory,
     turn_rate_at,
 )
-from semdb.recordings.base import DroppedFrame, FrameEntry, Recording
+from semdb.recordings.base import DroppedFrame, FrameEntry, Layout, Recording
 from semdb.recordings.cameras import CAMERA_FILE, TUM_DEPTH_SCALE, read_camera_file, tum_camera
+from semdb.recordings.options import ReadOptions
 from semdb.types import Camera
 
 LIMIT_MS = MAX_TIME_DIFFERENCE_NS / 1e6
@@ -32,7 +34,7 @@ def is_tum(path: Path) -> bool:
     return (path / "rgb.txt").is_file()
 
 
-def open_tum(path: Path, camera: Camera | None = None) -> Recording:
+def open_tum(path: Path, camera: Camera | None = None, options: ReadOptions | None = None) -> Recording:
     """A recording with ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``; with ``masks/`` it is a synthetic one.
 
     The camera is, in this order: the one given, ``camera.json``, the one that the folder's name stands for, ROS'
@@ -40,6 +42,7 @@ def open_tum(path: Path, camera: Camera | None = None) -> Recording:
     a recording without ``depth.txt`` or ``groundtruth.txt`` has all its frames without them (noted).
     Raises RecordingError.
     """
+    options = options or ReadOptions()
     name = path.resolve().name
     files, bad = read_file_list(path / "rgb.txt")
     draft = Draft(
@@ -52,12 +55,13 @@ def open_tum(path: Path, camera: Camera | None = None) -> Recording:
         depth_scale=TUM_DEPTH_SCALE,
     )
     colour = _sorted_by_time(files, "rgb.txt", draft.notes)
-    depth = _read_depth_list(path, draft.notes)
-    trajectory = _read_poses(path, draft.notes)
+    depth = _read_depth_list(path, draft.notes, options)
+    trajectory = _read_poses(path, draft.notes, options)
     draft.categories = read_categories(path)
     if draft.categories is not None:
         draft.format = "synthetic"
     _set_camera(draft, path, name, camera)
+    draft.depth_scale = options.depth_scale or draft.depth_scale
     _associate(draft, colour, depth, trajectory)
     return finish(draft, camera)
 
@@ -94,13 +98,16 @@ def _sorted_by_time(files: list[TimedFile], list_name: str, notes: list[str]) ->
     return ordered
 
 
-def _read_depth_list(path: Path, notes: list[str]) -> list[TimedFile] | None:
+def _read_depth_list(path: Path, notes: list[str], options: ReadOptions) -> list[TimedFile] | None:
     if not (path / "depth.txt").is_file():
         notes.append("no depth.txt: the frames have no depth")
         return None
     files, bad = read_file_list(path / "depth.txt")
     if bad:
         notes.append(bad_lines_note("depth.txt", bad, "times or names"))
+    if options.depth_offset_ms:
+        shift = round(options.depth_offset_ms * 1e6)
+        files = [replace(file, time_ns=file.time_ns + shift) for file in files]
     ordered = _sorted_by_time(files, "depth.txt", notes)
     unique = [file for i, file in enumerate(ordered) if i == 0 or file.time_ns != ordered[i - 1].time_ns]
     if len(unique) < len(ordered):
@@ -108,11 +115,11 @@ def _read_depth_list(path: Path, notes: list[str]) -> list[TimedFile] | None:
     return unique
 
 
-def _read_poses(path: Path, notes: list[str]) -> Trajectory | None:
+def _read_poses(path: Path, notes: list[str], options: ReadOptions) -> Trajectory | None:
     if not (path / "groundtruth.txt").is_file():
         notes.append("no groundtruth.txt: the frames have no pose and cannot become keyframes")
         return None
-    trajectory, pose_notes = read_trajectory(path / "groundtruth.txt")
+    trajectory, pose_notes = read_trajectory(path / "groundtruth.txt", options)
     notes += pose_notes
     return trajectory
 
@@ -166,3 +173,12 @@ def _associate(
                 turn_rate=turn_rate,
             )
         )
+
+
+LAYOUT = Layout(
+    "tum",
+    "TUM RGB-D (rgb.txt, depth.txt, groundtruth.txt)",
+    is_tum,
+    lambda path, camera, options: [open_tum(path, camera, options)],
+    frozenset({"depth_scale", "poses_are", "axes", "quaternion", "time_offset_ms", "depth_offset_ms"}),
+)

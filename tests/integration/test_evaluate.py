@@ -62,7 +62,7 @@ def test_one_recording_that_fails_costs_no_other_its_results(room: Path, tmp_pat
     assert (result["recording"], result["keyframes"], result["queries"]) == (room.name, 8, 4)
     assert "not evaluated: short: " in output
     assert "8 keyframes were asked for, but only 5 frames can be used" in output
-    assert f"not evaluated: {tmp_path / 'missing'}: no such folder" in output
+    assert f"not evaluated: {tmp_path / 'missing'}: no such folder or file" in output
     page = (tmp_path / "report" / "index.html").read_text()
     assert "<b>short</b> was not evaluated" in page
     assert page.count("data:image/jpeg") == 4  # all queries are among the ten to look at
@@ -70,9 +70,9 @@ def test_one_recording_that_fails_costs_no_other_its_results(room: Path, tmp_pat
 
 def test_nothing_evaluated_is_the_error_itself_said_once(tmp_path: Path) -> None:
     missing, gone = tmp_path / "missing", tmp_path / "gone"
-    assert evaluate(missing, cwd=tmp_path, code=1) == f"semdb: {missing}: no such folder\n"
+    assert evaluate(missing, cwd=tmp_path, code=1) == f"semdb: {missing}: no such folder or file\n"
     output = evaluate(missing, gone, "--json", "none.json", cwd=tmp_path, code=1)
-    assert output == "".join(f"semdb: not evaluated: {path}: no such folder\n" for path in (missing, gone))
+    assert output == "".join(f"semdb: not evaluated: {path}: no such folder or file\n" for path in (missing, gone))
     assert not (tmp_path / "none.json").exists()
 
 

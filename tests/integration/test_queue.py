@@ -19,8 +19,10 @@ from semdb.database.store import Store, open_store
 from semdb.errors import ProvenanceError, RecordingError, RecordingUnavailableError, UsageError
 from semdb.ingest import IngestOptions, ingest_recordings
 from semdb.queueing import CHUNK, Workplace, parts, queue_recordings, sweep
-from semdb.recordings.source import fetch, parse_source, write_source
+from semdb.recordings.options import ReadOptions
+from semdb.recordings.source import Source, fetch, parse_source, write_source
 from semdb.settings import Settings
+from semdb.types import Camera
 from tests.integration.comparison import content
 
 Message = tuple[int, str, tuple[int, ...]]
@@ -85,7 +87,7 @@ def test_a_lost_mount_is_waited_for_and_a_deleted_recording_is_not(room: Path, t
     queue_recordings([str(mount)], own, IngestOptions(stride=4, map_name="m"), outbox.send)
     mount.rename(away)
     place = Workplace(own)
-    with pytest.raises(RecordingUnavailableError, match="no such folder on this machine") as caught:
+    with pytest.raises(RecordingUnavailableError, match="no such folder or file on this machine") as caught:
         place.do(*outbox[0])
     assert isinstance(caught.value, MAY_HEAL)
     with open_store(url) as store:
@@ -223,10 +225,18 @@ def test_urls_that_lead_nowhere(tmp_path: Path) -> None:
 
 
 def test_a_camera_that_was_given_travels_with_the_source() -> None:
-    source = write_source("s3://bucket/room", "500,510,320,240")
-    address, camera = parse_source(source)
-    assert (address, camera.fx if camera else None, camera.fy if camera else None) == ("s3://bucket/room", 500, 510)
-    assert parse_source("/data/room") == ("/data/room", None)
+    source = parse_source(write_source("s3://bucket/room", "500,510,320,240"))
+    assert (source.address, source.parsed_camera) == ("s3://bucket/room", Camera(0, 0, 500, 510, 320, 240))
+    assert source.options == ReadOptions()
+    assert parse_source("/data/room") == Source("/data/room")
+
+
+def test_how_a_recording_is_read_travels_with_the_source() -> None:
+    options = ReadOptions(depth_scale=1000, poses_are="camera_from_world", color_topic="/a b/c&d?", time_offset_ms=-0.1)
+    for camera in (None, "500,510,320,240"):
+        written = write_source("/data/what?/room", camera, options)
+        assert parse_source(written) == Source("/data/what?/room", camera, options)
+    assert write_source("/data/room", None, ReadOptions(scale=2.0)) == "/data/room?scale=2.0"
 
 
 def test_rates_of_the_last_looks() -> None:

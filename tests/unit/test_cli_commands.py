@@ -285,7 +285,7 @@ def test_synth_then_recording() -> None:
 
 
 def test_recording_says_what_is_wrong() -> None:
-    assert run("recording", "nowhere", code=1).stderr == "semdb: nowhere: no such folder\n"
+    assert run("recording", "nowhere", code=1).stderr == "semdb: nowhere: no such folder or file\n"
     Path("empty").mkdir()
     assert "the folder is empty" in run("recording", "empty", code=1).stderr
     assert "--camera" in run("recording", "empty", "--camera", "1,2", code=2).stderr

@@ -32,19 +32,19 @@ def test_no_such_path_a_file_an_empty_folder_and_other_stuff(tmp_path: Path) -> 
     with pytest.raises(RecordingError, match="no such folder"):
         open_recording(tmp_path / "nowhere")
     (tmp_path / "file.bag").write_text("x")
-    with pytest.raises(RecordingError, match="is a file; a recording is a folder"):
+    with pytest.raises(RecordingError, match="is a file that no reader knows; known are: "):
         open_recording(tmp_path / "file.bag")
     (tmp_path / "empty").mkdir()
     with pytest.raises(RecordingError, match="the folder is empty"):
         open_recording(tmp_path / "empty")
-    with pytest.raises(RecordingError, match="is no recording that semdb knows; known layouts: TUM"):
+    with pytest.raises(RecordingError, match="is no recording that semdb knows; known are: ICL-NUIM"):
         open_recordings(tmp_path)
 
 
 def test_a_folder_of_recordings_names_them(tmp_path: Path) -> None:
     write_tum(tmp_path / "b", n=1)
     write_icl(tmp_path / "a", n=2)
-    with pytest.raises(RecordingError, match=r"is no recording itself, but these folders in it are: a, b"):
+    with pytest.raises(RecordingError, match=r"is no recording itself, but these in it are: a, b"):
         open_recording(tmp_path)
 
 

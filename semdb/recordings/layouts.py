@@ -1,0 +1,53 @@
+"""Every kind of recording that semdb knows, in the order in which they are tried."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+from semdb.errors import RecordingError, UsageError
+from semdb.recordings import icl_nuim, seven_scenes, tum
+from semdb.recordings.base import Layout, Recording
+from semdb.recordings.options import ReadOptions, option_of
+from semdb.types import Camera
+
+LAYOUTS: tuple[Layout, ...] = (icl_nuim.LAYOUT, tum.LAYOUT, seven_scenes.LAYOUT)
+CHILDREN_LOOKED_AT = 200
+
+
+def find_layout(path: Path) -> Layout | None:
+    """The layout of a folder or file that is there; None where no reader knows it."""
+    return next((layout for layout in LAYOUTS if layout.matches(path)), None)
+
+
+def open_with(layout: Layout, path: Path, camera: Camera | None, options: ReadOptions) -> list[Recording]:
+    """Opens `path`. Raises UsageError for an option that means nothing to this layout, RecordingError."""
+    foreign = sorted(set(options.given()) - layout.takes)
+    if foreign:
+        names = ", ".join(option_of(name) for name in foreign)
+        fitting = [option_of(field.name) for field in fields(ReadOptions) if field.name in layout.takes]
+        raise UsageError(f"{path}: {names} means nothing to a recording of format {layout.name}; it takes {fitting}")
+    return layout.open(path, camera, options)
+
+
+def not_a_recording(path: Path) -> RecordingError:
+    """The error for what no reader knows, with what may have been meant."""
+    known = f"known are: {'; '.join(layout.about for layout in LAYOUTS)}"
+    if path.is_file():
+        return RecordingError(f"{path}: is a file that no reader knows; {known}")
+    children = sorted(path.iterdir())
+    if not children:
+        return RecordingError(f"{path}: the folder is empty; {known}")
+    inside = [child.name for child in children[:CHILDREN_LOOKED_AT] if _looks_like_recording(child)]
+    if inside:
+        return RecordingError(f"{path}: is no recording itself, but these in it are: {', '.join(inside[:10])}")
+    if (path / "depth.txt").exists() or (path / "groundtruth.txt").exists():
+        return RecordingError(f"{path / 'rgb.txt'}: the file is missing; the TUM layout needs it")
+    return RecordingError(f"{path}: is no recording that semdb knows; {known}")
+
+
+def _looks_like_recording(path: Path) -> bool:
+    try:
+        return find_layout(path) is not None
+    except OSError:
+        return False

@@ -1,0 +1,146 @@
+"""What a user says about a recording beside its files: which poses, axes, times and scales they are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from semdb.errors import UsageError
+from semdb.geometry import invert_pose, pose_error, pose_from, rotation_from_quat_wxyz
+from semdb.recordings import ReadOptions, open_recording
+from semdb.recordings.options import AXES, read_options, write_options
+from tests.unit.recording_miniatures import SMALL, pose, pose_text, write_icl, write_seven_scenes, write_tum
+
+TIMES = [f"{100 + i * 0.1:.6f}" for i in range(6)]
+
+
+def write_poses(folder: Path, texts: list[str], shift_s: float = 0.0) -> None:
+    times = [f"{float(time) + shift_s:.6f}" for time in TIMES]
+    (folder / "groundtruth.txt").write_text(
+        "\n".join(f"{time} {text}" for time, text in zip(times, texts, strict=True))
+    )
+
+
+def poses_of(folder: Path, options: ReadOptions) -> list[np.ndarray]:
+    found = [entry.world_from_camera for entry in open_recording(folder, options=options).entries]
+    return [pose for pose in found if pose is not None]
+
+
+def assert_right(found: list[np.ndarray], n: int = 6) -> None:
+    assert len(found) == n
+    for i, one in enumerate(found):
+        assert max(pose_error(one, pose(i))) < 1e-6
+
+
+def test_inverted_poses(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "walk")
+    write_poses(folder, [pose_text(invert_pose(pose(i))) for i in range(6)])
+    assert_right(poses_of(folder, ReadOptions(poses_are="camera_from_world")))
+
+
+@pytest.mark.parametrize("axes", sorted(AXES))
+def test_axes_are_of_the_camera_whose_pose_is_given(tmp_path: Path, axes: str) -> None:
+    # the forward axis of an OpenCV camera in each of the axes, by its definition
+    forward = {"opencv": [0, 0, 1], "opengl": [0, 0, -1], "arkit": [0, 0, -1], "ros": [1, 0, 0]}[axes]
+    down = {"opencv": [0, 1, 0], "opengl": [0, -1, 0], "arkit": [0, -1, 0], "ros": [0, 0, -1]}[axes]
+    np.testing.assert_array_equal(AXES[axes][:3, 2], forward)
+    np.testing.assert_array_equal(AXES[axes][:3, 1], down)
+    assert np.linalg.det(AXES[axes]) == pytest.approx(1)
+    folder = write_tum(tmp_path / "walk")
+    write_poses(folder, [pose_text(pose(i) @ invert_pose(AXES[axes])) for i in range(6)])
+    assert_right(poses_of(folder, ReadOptions(axes=axes)))
+
+
+def test_quaternions_in_the_other_order_and_another_clock(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "walk")
+    turned = []
+    for i in range(6):
+        x, y, z, qx, qy, qz, qw = pose_text(pose(i)).split()
+        turned.append(" ".join((x, y, z, qw, qx, qy, qz)))
+    write_poses(folder, turned, shift_s=0.25)
+    assert_right(poses_of(folder, ReadOptions(quaternion="wxyz", time_offset_ms=-250)))
+
+
+def test_depth_of_another_scale_and_clock(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "walk")
+    listed = (folder / "depth.txt").read_text().split("\n")[1:-1]
+    shifted = [f"{float(line.split()[0]) + 0.3:.6f} {line.split()[1]}" for line in listed]
+    (folder / "depth.txt").write_text("\n".join(shifted))
+    plain = open_recording(folder)
+    assert len(plain.entries) == 3  # 0.3 s later there is depth, but of another frame
+    recording = open_recording(folder, options=ReadOptions(depth_scale=2500, depth_offset_ms=-300))
+    assert len(recording.entries) == 6
+    assert recording.depth_scale == 2500
+    right, double = open_recording(write_tum(tmp_path / "right")), recording.read_depth(recording.entries[2])
+    np.testing.assert_allclose(double, 2 * right.read_depth(right.entries[2]), rtol=1e-6)
+
+
+def test_options_reach_the_poses_before_the_format_turns_them(tmp_path: Path) -> None:
+    options = ReadOptions(poses_are="camera_from_world")
+    for write in (write_icl, write_seven_scenes):
+        right = write(tmp_path / "right" / write.__name__)
+        wrong = write(tmp_path / "wrong" / write.__name__)
+        for file in wrong.glob("*.pose.txt"):
+            np.savetxt(file, invert_pose(np.loadtxt(file)))
+        for file in wrong.glob("*.freiburg"):
+            lines = []
+            for line in file.read_text().splitlines():
+                number, *values = line.split()
+                x, y, z, qx, qy, qz, qw = map(float, values)
+                one = pose_from(rotation_from_quat_wxyz([qw, qx, qy, qz]), [x, y, z])
+                lines.append(f"{number} {pose_text(invert_pose(one))}")
+            file.write_text("\n".join(lines))
+        camera = None if write is write_seven_scenes else SMALL
+        expected = [entry.world_from_camera for entry in open_recording(right, camera).entries]
+        found = [entry.world_from_camera for entry in open_recording(wrong, camera, options).entries]
+        assert len(found) == len(expected) >= 2
+        for one, other in zip(found, expected, strict=True):
+            assert max(pose_error(one, other)) < 1e-6
+
+
+def test_an_option_that_means_nothing_to_the_format_is_refused(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "walk")
+    with pytest.raises(UsageError, match=r"walk: --color-topic means nothing to a recording of format tum; it takes"):
+        open_recording(folder, options=ReadOptions(color_topic="/camera/rgb"))
+    with pytest.raises(UsageError, match="--time-offset-ms"):
+        open_recording(write_seven_scenes(tmp_path / "seq-01"), options=ReadOptions(time_offset_ms=3))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"depth_scale": 0.0}, "--depth-scale must be a positive number"),
+        ({"scale": float("nan")}, "--scale must be a positive number"),
+        ({"poses_are": "inverted"}, "--poses-are inverted: known are world_from_camera, camera_from_world"),
+        ({"axes": "unity"}, "--axes unity: known are opencv, opengl, arkit, ros"),
+        ({"quaternion": "zyxw"}, "--quaternion zyxw"),
+        ({"time_offset_ms": float("inf")}, "--time-offset-ms must be a number of milliseconds"),
+    ],
+)
+def test_options_that_make_no_sense(wrong: dict[str, object], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        ReadOptions(**wrong)  # type: ignore[arg-type]
+
+
+@given(
+    st.builds(
+        ReadOptions,
+        depth_scale=st.none() | st.floats(1e-3, 1e6),
+        axes=st.none() | st.sampled_from(sorted(AXES)),
+        poses_are=st.sampled_from(["world_from_camera", "camera_from_world"]),
+        time_offset_ms=st.floats(-1e9, 1e9),
+        color_topic=st.none() | st.text(min_size=1),
+    )
+)
+def test_options_are_written_and_read(options: ReadOptions) -> None:
+    assert read_options(write_options(options)) == options
+
+
+@pytest.mark.parametrize(("text", "message"), [("zoom=3", "'zoom' is no option"), ("scale=big", "'big' is no number")])
+def test_written_options_that_are_none(text: str, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        read_options(text)
