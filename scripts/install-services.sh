@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# The servers that the tests run on loopback: MariaDB with Galera, and Redis. Tests on another server name it in
+# The servers that the tests run on loopback: MariaDB with Galera, and Redis; zsh, to press TAB in it. Tests on another server name it in
 # SEMDB_TEST_MYSQL_URL; those that kill servers, and those of a cluster, need them here.
 set -euo pipefail
 PATH=$PATH:/usr/sbin:/usr/local/sbin
@@ -9,6 +9,7 @@ command -v mariadbd >/dev/null || packages+=(mariadb-server)
 [ -e /usr/lib/galera/libgalera_smm.so ] || packages+=(galera-4)
 command -v rsync >/dev/null || packages+=(rsync)
 command -v redis-server >/dev/null || packages+=(redis-server)
+command -v zsh >/dev/null || packages+=(zsh)
 
 if [ ${#packages[@]} -gt 0 ] && ! "$(dirname "$0")/apt-install.sh" "${packages[@]}"; then
   if command -v mariadbd >/dev/null || [ -n "${SEMDB_TEST_MYSQL_URL:-}" ]; then

@@ -119,10 +119,50 @@ def _print_version(value: bool) -> None:
         raise typer.Exit(0)
 
 
+def _install_completion(value: bool) -> None:
+    if value:
+        from semdb.cli.completion.shells import current_shell, install
+
+        try:
+            shell = current_shell()
+            script = install(shell)
+        except (SemdbError, OSError) as error:
+            raise typer.Exit(report(error)) from None
+        print(f"completion for {shell.name} is in {script}; {shell.start_file} loads it")
+        print(f"it works in new terminals; in this one: source {script}")
+        raise typer.Exit(0)
+
+
+def _show_completion(value: bool) -> None:
+    if value:
+        from semdb.cli.completion.shells import current_shell
+
+        try:
+            print(current_shell().script, end="")
+        except SemdbError as error:
+            raise typer.Exit(report(error)) from None
+        raise typer.Exit(0)
+
+
 @app.callback()
 def root(
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+    install_completion: Annotated[
+        bool,
+        typer.Option(
+            "--install-completion",
+            callback=_install_completion,
+            is_eager=True,
+            help="Make this shell (bash or zsh) complete commands, options and names, and exit.",
+        ),
+    ] = False,
+    show_completion: Annotated[
+        bool,
+        typer.Option(
+            "--show-completion", callback=_show_completion, is_eager=True, help="Print the script for it and exit."
+        ),
     ] = False,
 ) -> None:
     """A visual semantic database: RGB-D recordings become rows to ask questions of, images become camera poses.
@@ -133,6 +173,11 @@ def root(
 
 def main() -> None:
     """Entry point of the `semdb` command."""
+    if "_SEMDB_COMPLETE" in os.environ:  # a shell asks what fits where its cursor is
+        from semdb.cli.completion import answer
+
+        print(answer(typer.main.get_command(app)))
+        return
     try:
         app(prog_name="semdb")
     except KeyboardInterrupt as error:  # before a command began
