@@ -65,8 +65,8 @@ bench-output/room: | $(VENV)/.stamp-dev
 	$(BIN)/semdb synth $@
 
 bench: $(VENV)/.stamp-dev $(RECORDINGS)
-	@for file in $$(grep -l '^if __name__' bench/[a-z]*.py); do \
-	  name=$$(basename "$$file" .py); mkdir -p bench-output; \
+	@for file in $$(grep -l '^if __name__' bench/*.py bench/*/__main__.py); do \
+	  name=$${file#bench/}; name=$${name%/__main__.py}; name=$${name%.py}; mkdir -p bench-output; \
 	  echo "== bench.$$name"; $(BIN)/python -m "bench.$$name" $(RECORDINGS) --json "bench-output/$$name.json"; \
 	done
 

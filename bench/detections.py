@@ -26,7 +26,7 @@ from semdb.cli.output import print_table
 from semdb.cli.progress import Progress
 from semdb.evaluation.runner import EvaluateOptions, evaluate
 from semdb.geometry import back_project, invert_pose, pose_distances, project, transform_points
-from semdb.keyframes import select_keyframes
+from semdb.ingestion.keyframes import select_keyframes
 from semdb.perception import describe
 from semdb.perception.detections import DetectionRules
 from semdb.perception.detectors import load_detector

@@ -28,11 +28,11 @@ import cv2
 
 from semdb.cli.options import load_settings
 from semdb.database.store import Store, open_store
-from semdb.ingest import IngestOptions, ingest_recording, make_describers, plan_ingest
-from semdb.item_work import Item, _claims, _describe, _read, _store
-from semdb.keyframes import select_keyframes
-from semdb.model_choice import specs_for_ingest
+from semdb.ingestion.keyframes import select_keyframes
+from semdb.ingestion.run import IngestOptions, ingest_recording, make_describers, plan_ingest
+from semdb.ingestion.work import Item, _claims, _describe, _read, _store
 from semdb.perception.describe import Describer
+from semdb.perception.model_choice import specs_for_ingest
 from semdb.recordings import open_recordings
 from semdb.recordings.base import FrameEntry, Recording
 

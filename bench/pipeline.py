@@ -20,11 +20,11 @@ from semdb.cli.options import load_settings
 from semdb.database.store import Store
 from semdb.evaluation.protocols import split_paper
 from semdb.evaluation.workspace import evaluation_store
-from semdb.ingest import IngestOptions, ingest_recording
-from semdb.keyframes import select_keyframes
-from semdb.localize import make_localizer
-from semdb.model_choice import specs_for_ingest
+from semdb.ingestion.keyframes import select_keyframes
+from semdb.ingestion.run import IngestOptions, ingest_recording
+from semdb.localization.images import make_localizer
 from semdb.perception.describe import Describer, describer_from_specs
+from semdb.perception.model_choice import specs_for_ingest
 from semdb.recordings import open_recordings
 from semdb.recordings.base import FrameEntry, Recording
 

@@ -35,7 +35,7 @@ from bench.pose_query import measure_query, show_query
 from semdb.evaluation.baselines import nearest_in_pose
 from semdb.evaluation.protocols import split_paper
 from semdb.geometry import invert_pose, pose_error, pose_from, so3_exp
-from semdb.keyframes import select_keyframes
+from semdb.ingestion.keyframes import select_keyframes
 from semdb.localization.bundle import pixel_sigma
 from semdb.localization.pairs import join_pairs, world_points_of
 from semdb.localization.pose import PoseOptions, estimate_pose, match_views

@@ -24,8 +24,8 @@ from semdb.database.records import KeyframeRecord, RecordingPlan
 from semdb.database.store import Store, open_store
 from semdb.geometry import pose_distances, pose_error
 from semdb.localization.coarse import CoarseOptions, Scoring
+from semdb.localization.images import make_localizer
 from semdb.localization.localizer import LocalizerOptions
-from semdb.localize import make_localizer
 from semdb.perception.describe import Describer
 from semdb.perception.detectors.recorded import RecordedDetector
 from semdb.perception.encoders.gist import GistEncoder
@@ -33,7 +33,7 @@ from semdb.perception.features import load_features
 from semdb.recordings.synthetic import SyntheticFrame, SyntheticOptions, SyntheticSequence
 from semdb.recordings.synthetic.mistakes import make_mistakes, with_misnamed
 from semdb.recordings.synthetic.writer import building
-from semdb.refine import refine_map
+from semdb.refinement.run import refine_map
 from semdb.settings import Settings
 from semdb.types import Camera, Description, FloatArray, InstanceMasks, Verdict
 

@@ -1,4 +1,4 @@
-"""The Celery application ``semdb.workers``: ``celery --app semdb.workers worker``. Thin over `semdb.queueing`.
+"""The Celery application ``semdb.workers``: ``celery --app semdb.workers worker``. Thin over `semdb.ingestion.queue`.
 
 The broker is the setting SEMDB_BROKER_URL. Messages say what to do, the database says what is done: a message may
 be lost or arrive twice, and running a task again adds nothing.

@@ -17,7 +17,7 @@ from semdb.database import retry
 from semdb.database.items import LEASE_S
 from semdb.errors import SemdbError
 from semdb.events import event
-from semdb.queueing import ChunkOutcome
+from semdb.ingestion.queue import ChunkOutcome
 
 from . import BrokerError, metrics, send_items, stopping
 

@@ -11,7 +11,7 @@ from semdb.database import retry
 from semdb.database.store import open_store
 from semdb.errors import SemdbError
 from semdb.events import LOGGER, JsonFormatter, event
-from semdb.queueing import sweep
+from semdb.ingestion.queue import sweep
 from semdb.settings import Settings
 
 from . import metrics, send_items, stopping

@@ -11,9 +11,9 @@ from celery.exceptions import Reject, SoftTimeLimitExceeded
 from semdb.database import retry
 from semdb.errors import RecordingError, RecordingUnavailableError, UsageError
 from semdb.events import event
-from semdb.ingest import IngestOptions
-from semdb.item_work import log_item
-from semdb.queueing import Workplace, queue_recordings
+from semdb.ingestion.queue import Workplace, queue_recordings
+from semdb.ingestion.run import IngestOptions
+from semdb.ingestion.work import log_item
 from semdb.recordings.options import read_options
 from semdb.recordings.source import is_address
 from semdb.settings import Settings

@@ -11,8 +11,8 @@ from semdb.cli.ending import ends_when_told
 from semdb.cli.options import CameraOption, JsonFlag, Overrides, Reading, reading_options, settings_options
 
 if TYPE_CHECKING:
-    from semdb.ingest import IngestSummary
-    from semdb.queueing import Send
+    from semdb.ingestion.queue import Send
+    from semdb.ingestion.run import IngestSummary
     from semdb.settings import Settings
 
 
@@ -53,8 +53,8 @@ def command(
     from semdb.cli.progress import StagedProgress, say
     from semdb.errors import UsageError
     from semdb.events import log_to
-    from semdb.ingest import IngestOptions, ingest_recordings
-    from semdb.queueing import queue_recordings
+    from semdb.ingestion.queue import queue_recordings
+    from semdb.ingestion.run import IngestOptions, ingest_recordings
     from semdb.recordings.options import option_of
 
     settings = overrides.settings(batch=batch)
@@ -111,7 +111,7 @@ def _send() -> Send:
 def _resume(settings: Settings, *, json: bool) -> None:
     from semdb.cli.output import print_json
     from semdb.database.store import open_store
-    from semdb.queueing import sweep
+    from semdb.ingestion.queue import sweep
 
     with open_store(settings.database_url) as store:
         sent = sweep(store, _send(), all_pending=True)

@@ -11,7 +11,7 @@ from semdb.cli.options import CameraOption, JsonFlag, Overrides, settings_option
 
 if TYPE_CHECKING:
     from semdb.errors import FrameError
-    from semdb.localize import ImageLocalization
+    from semdb.localization.images import ImageLocalization
 
 
 @settings_options(models=True)
@@ -43,7 +43,7 @@ def command(
     from semdb.cli.output import print_json
     from semdb.cli.progress import say
     from semdb.database.store import open_store
-    from semdb.localize import LocalizeOptions, localize_images
+    from semdb.localization.images import LocalizeOptions, localize_images
     from semdb.recordings import parse_camera
 
     settings = overrides.settings()
@@ -65,7 +65,7 @@ def command(
             else:
                 print(as_text(answer), flush=True)
             if plot is not None:
-                from semdb.localization_pictures import write_picture
+                from semdb.pictures.localization import write_picture
 
                 say(f"wrote {write_picture(plot, store, answer, pictures)}")
     if json:

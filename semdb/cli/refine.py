@@ -26,7 +26,7 @@ def command(
     from semdb.cli.output import print_json
     from semdb.cli.progress import StagedProgress, say
     from semdb.database.store import open_store
-    from semdb.refine import refine_map, steps_of
+    from semdb.refinement.run import refine_map, steps_of
 
     steps_of(step or ())
     done: list[dict[str, Any]] = []

@@ -17,7 +17,7 @@ from semdb.evaluation.calibration import (
 )
 from semdb.evaluation.metrics import EvaluationResult
 from semdb.evaluation.plots import SERIES, style_axes
-from semdb.pictures import FAINT, INK
+from semdb.pictures.drawing import FAINT, INK
 from semdb.types import BoolArray, FloatArray
 
 INSIDE = 3  # series whose names have room inside the axes

@@ -16,8 +16,8 @@ from matplotlib.ticker import NullFormatter, PercentFormatter
 
 from semdb.evaluation.metrics import FALSE_TRANSLATION_M, TIMING_STAGES, EvaluationResult, QueryResult
 from semdb.evaluation.published import PAPER_ROTATION, PAPER_TRANSLATION
-from semdb.pictures import FAINT, INK, VERDICT_COLOURS
-from semdb.top_view import horizontal_axes
+from semdb.pictures.drawing import FAINT, INK, VERDICT_COLOURS
+from semdb.pictures.top_view import horizontal_axes
 from semdb.types import FloatArray, Verdict
 
 TRANSLATION_RANGE_M = 0.5

@@ -17,8 +17,8 @@ from semdb.evaluation.splits import folder_plan, paper_plans, scene_plan, tell_a
 from semdb.evaluation.tasks import GIVEN, REFINED, Plan, Task, refine_truth
 from semdb.evaluation.workspace import evaluation_store
 from semdb.evaluation.worst import PackedDetection, Shown, draw_worst
-from semdb.localize import check_coarse
-from semdb.model_choice import specs_for_ingest
+from semdb.localization.images import check_coarse
+from semdb.perception.model_choice import specs_for_ingest
 from semdb.recordings.base import Recording
 from semdb.recordings.options import AS_THE_FORMAT_SAYS, ReadOptions
 from semdb.settings import Settings

@@ -15,11 +15,11 @@ from semdb.evaluation.methods import COLMAP, ORACLE, SIFT_REFERENCE, Method
 from semdb.evaluation.metrics import QueryResult, query_result, with_reach
 from semdb.evaluation.retrieval import FIRST, reach
 from semdb.evaluation.tasks import Part, Task
-from semdb.ingest import IngestOptions, ingest_recording
+from semdb.ingestion.run import IngestOptions, ingest_recording
+from semdb.localization.images import make_localizer
 from semdb.localization.localizer import Localizer
-from semdb.localize import make_localizer
 from semdb.perception.describe import Describer, describer_from_specs
-from semdb.refine import refine_map
+from semdb.refinement.run import refine_map
 from semdb.settings import Settings
 from semdb.types import Description, Detection, FloatArray, Frame, Localization, ModelInfo
 

@@ -13,7 +13,7 @@ from semdb.evaluation.protocols import PAPER, SPLIT, evenly_spaced, split_paper
 from semdb.evaluation.published import PaperRow, counts_like, sequence_of
 from semdb.evaluation.refined_truth import Disagreement, disagreement, refine_poses
 from semdb.evaluation.rolling_shutter import rates_between
-from semdb.keyframes import select_keyframes
+from semdb.ingestion.keyframes import select_keyframes
 from semdb.recordings.base import FrameEntry, Recording
 from semdb.types import Camera, Float32Array, FloatArray, ImageArray
 

@@ -16,7 +16,7 @@ from semdb.evaluation.failures import explain, median_sharpness
 from semdb.evaluation.metrics import EvaluationResult, QueryResult
 from semdb.evaluation.runs import Run
 from semdb.evaluation.tasks import Task
-from semdb.pictures import draw_localization
+from semdb.pictures.drawing import draw_localization
 from semdb.types import Detection, Float32Array, ImageArray, Localization
 
 WORST = 10

@@ -14,8 +14,8 @@ import numpy as np
 
 from semdb.geometry import invert_pose, pixels_to_normalized, transform_points
 from semdb.localization.bundle import QUERY, BundleResult
-from semdb.localization.threads import each
 from semdb.localization.views import KeyframeView, View
+from semdb.threads import each
 from semdb.types import BoolArray, FloatArray, IntArray
 
 LEAST_LIKENESS = 0.9  # correlation of the patches

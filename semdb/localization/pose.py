@@ -15,8 +15,8 @@ from semdb.localization.alignment import Alignment, align_pairs
 from semdb.localization.bundle import BundleResult, MotionPrior
 from semdb.localization.matching import Matches, MatchingOptions, match_keypoints
 from semdb.localization.pairs import Pairs, guided_pairs, join_pairs, reprojection_px, world_points_of
-from semdb.localization.threads import cores, each
 from semdb.localization.views import KeyframeView, View
+from semdb.threads import cores, each
 from semdb.types import BoolArray, FloatArray, IntArray
 
 MINIMUM_PAIRS = 6  # below, a pose from 3 points has nothing to be checked with

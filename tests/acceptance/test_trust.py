@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import pytest
 
-from bench.trust import ask_world
-from bench.trust_rows import Row
-from bench.trust_suites import HARD, NEGATIVE, POSITIVE, RenderedSize, rendered_world
+from bench.trust.asking import ask_world
+from bench.trust.rows import Row
+from bench.trust.suites import HARD, NEGATIVE, POSITIVE, RenderedSize, rendered_world
 from semdb.evaluation.calibration import auroc
 from semdb.settings import Settings
 

@@ -18,12 +18,12 @@ from semdb.cli.options import Overrides, load_settings
 from semdb.database import items
 from semdb.database.store import Store, open_store
 from semdb.errors import ModelError, UsageError
-from semdb.ingest import IngestOptions, ingest_recording, ingest_recordings, plan_ingest
-from semdb.item_work import work_off
+from semdb.ingestion.queue import Workplace, queue_recordings
+from semdb.ingestion.run import IngestOptions, ingest_recording, ingest_recordings, plan_ingest
+from semdb.ingestion.work import work_off
 from semdb.perception.describe import Describer
 from semdb.perception.encoders import load_encoder
 from semdb.perception.features import load_features
-from semdb.queueing import Workplace, queue_recordings
 from semdb.recordings import open_recordings
 from semdb.recordings.base import FrameEntry, Recording
 from semdb.settings import Settings
@@ -163,7 +163,7 @@ def test_a_batch_that_is_too_much_is_done_one_by_one(
     room: Path, store: Store, expected: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     events: list[tuple[str, dict[str, Any]]] = []
-    monkeypatch.setattr("semdb.item_work.event", lambda name, **fields: events.append((name, fields)))
+    monkeypatch.setattr("semdb.ingestion.work.event", lambda name, **fields: events.append((name, fields)))
     seen = Bright(lambda images: len(images) > 2)
     assert ingest(room, store, describer(3, seen)).stored == 8
     said = [fields for name, fields in events if name == "one_by_one"]

@@ -13,7 +13,7 @@ from semdb.database import retry, schema
 from semdb.database.engine import make_engine
 from semdb.database.store import open_store
 from semdb.errors import DatabaseError
-from semdb.ingest import IngestOptions, ingest_recordings
+from semdb.ingestion.run import IngestOptions, ingest_recordings
 from semdb.recordings.synthetic import SyntheticOptions
 from semdb.settings import Settings
 from tests import servers, services

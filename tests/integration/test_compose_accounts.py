@@ -16,7 +16,7 @@ from semdb.database import schema
 from semdb.database.engine import make_engine
 from semdb.database.store import open_store
 from semdb.errors import DatabaseError
-from semdb.ingest import IngestOptions, ingest_recordings
+from semdb.ingestion.run import IngestOptions, ingest_recordings
 from semdb.settings import Settings
 from semdb.workers import app as celery_app
 from tests import servers

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from semdb.database.store import open_store
-from semdb.ingest import ingest_recordings
+from semdb.ingestion.run import ingest_recordings
 from semdb.recordings import open_recording
 from semdb.recordings.synthetic import SyntheticOptions
 from semdb.settings import Settings

@@ -18,7 +18,7 @@ from sqlalchemy import select
 from semdb.database import tables
 from semdb.database.store import Store, open_store
 from semdb.errors import ProvenanceError, UsageError
-from semdb.ingest import IngestOptions, ingest_recordings
+from semdb.ingestion.run import IngestOptions, ingest_recordings
 from semdb.settings import Settings
 from tests.integration.comparison import NOT_COMPARED, content, rows_per_table
 from tests.rooms import COMMAND, environment, semdb

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from semdb.geometry import pose_error, pose_from, rotation_from_quat_wxyz
-from semdb.ingest import IngestOptions, ingest_recordings
+from semdb.ingestion.run import IngestOptions, ingest_recordings
 from semdb.recordings import open_recording
 from semdb.settings import Settings
 from tests.rooms import semdb, semdb_json

@@ -13,9 +13,9 @@ from celery.exceptions import Retry, SoftTimeLimitExceeded
 from semdb.cli.doctor import broker as check_broker
 from semdb.database import items
 from semdb.database.store import open_store
-from semdb.ingest import IngestOptions
-from semdb.item_work import Item
-from semdb.queueing import Workplace, queue_recordings
+from semdb.ingestion.queue import Workplace, queue_recordings
+from semdb.ingestion.run import IngestOptions
+from semdb.ingestion.work import Item
 from semdb.settings import Settings
 from semdb.workers import HARD_LIMIT_S, ITEMS_TASK, SOFT_LIMIT_S, VISIBILITY_S, BrokerError, nodes, tasks
 from tests import services

@@ -17,8 +17,8 @@ from semdb.database.reporting import workers
 from semdb.database.retry import MAY_HEAL, task_delay_s
 from semdb.database.store import Store, open_store
 from semdb.errors import ProvenanceError, RecordingError, RecordingUnavailableError, UsageError
-from semdb.ingest import IngestOptions, ingest_recordings
-from semdb.queueing import CHUNK, Workplace, parts, queue_recordings, sweep
+from semdb.ingestion.queue import CHUNK, Workplace, parts, queue_recordings, sweep
+from semdb.ingestion.run import IngestOptions, ingest_recordings
 from semdb.recordings.options import ReadOptions
 from semdb.recordings.source import Source, fetch, parse_source, write_source
 from semdb.settings import Settings

@@ -17,10 +17,10 @@ from semdb.database.records import KeyframePoints, KeyframeRecord, MapInfo
 from semdb.database.store import Store, open_store
 from semdb.errors import CodecError
 from semdb.geometry import pose_from, so3_exp
+from semdb.localization.images import make_localizer
 from semdb.localization.keyframe_cache import POINTS, KeyframeCache
 from semdb.localization.localizer import LocalizerOptions
-from semdb.localize import make_localizer
-from semdb.refine import refine_map
+from semdb.refinement.run import refine_map
 from semdb.types import Description, FloatArray, Keypoints
 from tests.database_samples import MODELS, description, plan, record
 from tests.unit.localization_scene import CAMERA, Scene

@@ -9,7 +9,7 @@ from sqlalchemy import func, select
 
 from semdb.database import tables
 from semdb.database.store import Store, open_store
-from semdb.ingest import IngestOptions, ingest_recordings
+from semdb.ingestion.run import IngestOptions, ingest_recordings
 from semdb.settings import Settings
 
 

@@ -17,11 +17,11 @@ from semdb.database import items
 from semdb.database.items import open_items, unsent
 from semdb.database.store import Store, open_store
 from semdb.database.tables import ingest_items
-from semdb.ingest import IngestOptions, ingest_recordings, make_describers
-from semdb.item_work import work_off
-from semdb.model_choice import ModelSpecs
+from semdb.ingestion.queue import queue_recordings
+from semdb.ingestion.run import IngestOptions, ingest_recordings, make_describers
+from semdb.ingestion.work import work_off
 from semdb.perception.describe import Describer
-from semdb.queueing import queue_recordings
+from semdb.perception.model_choice import ModelSpecs
 from semdb.recordings import open_recordings
 from semdb.recordings.synthetic import SyntheticOptions
 from semdb.settings import Settings
@@ -46,7 +46,7 @@ main()
 """
 HANGS = """
 import pathlib
-import semdb.item_work as work
+import semdb.ingestion.work as work
 semdb.workers.SOFT_LIMIT_S, semdb.workers.HARD_LIMIT_S = 2, 3
 read, healed = work._read, pathlib.Path({healed!r})
 def hang(recording, item):
@@ -56,7 +56,7 @@ def hang(recording, item):
 work._read = hang
 """
 SLOW = """
-import semdb.item_work as work
+import semdb.ingestion.work as work
 read = work._read
 work._read = lambda *given: (time.sleep(0.4), read(*given))[1]
 """

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from semdb.localization.confusion import Confusion, ConfusionOptions, PlacedObjects, co_detections, confusions, expand
+from semdb.refinement.confusion import Confusion, ConfusionOptions, PlacedObjects, co_detections, confusions, expand
 
 BED, COUCH, CUP = 0, 1, 2
 

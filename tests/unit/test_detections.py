@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from semdb.errors import UsageError
-from semdb.model_choice import settings_of_map
 from semdb.perception._masks import bounding_box
 from semdb.perception.describe import Describer
 from semdb.perception.detections import DetectionRules, MaskRules, rules_of
@@ -17,6 +16,7 @@ from semdb.perception.detectors.coco import COCO_91, INDOOR
 from semdb.perception.detectors.recorded import RecordedDetector
 from semdb.perception.encoders import load_encoder
 from semdb.perception.features import load_features
+from semdb.perception.model_choice import settings_of_map
 from semdb.perception.objects import at_one_depth, object_geometry
 from semdb.settings import Settings
 from semdb.types import Camera, Detection, Features, ImageArray, InstanceMasks, ModelInfo

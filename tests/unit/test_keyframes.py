@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from semdb.errors import RecordingError, UsageError
 from semdb.geometry import pose_distances, pose_error, pose_from, so3_exp
-from semdb.keyframes import farthest_views, overlap_from_pose_distance, select_keyframes
+from semdb.ingestion.keyframes import farthest_views, overlap_from_pose_distance, select_keyframes
+from semdb.ingestion.view_overlap import ViewStack, view_grid, view_overlap
 from semdb.recordings import open_recording
 from semdb.types import Camera, Float32Array, FloatArray
-from semdb.view_overlap import ViewStack, view_grid, view_overlap
 from tests.unit.recording_miniatures import write_tum
 
 CAMERA = Camera(320, 240, 200.0, 200.0, 159.5, 119.5)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from semdb.errors import UsageError
-from semdb.model_choice import settings_of_map, specs_for_ingest, specs_for_query
+from semdb.perception.model_choice import settings_of_map, specs_for_ingest, specs_for_query
 from semdb.settings import Settings
 from semdb.types import ModelInfo
 

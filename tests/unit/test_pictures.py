@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from semdb.geometry import pose_error, pose_from, so3_exp
-from semdb.pictures import (
+from semdb.pictures.drawing import (
     GAP,
     HEADER,
     MARGIN,
@@ -19,7 +19,7 @@ from semdb.pictures import (
     rgb,
     spread_out,
 )
-from semdb.top_view import MapObject, draw_top_view, horizontal_axes, merge_objects, scale_bar_metres
+from semdb.pictures.top_view import MapObject, draw_top_view, horizontal_axes, merge_objects, scale_bar_metres
 from semdb.types import Detection, FloatArray, ImageArray, Localization, Verdict
 
 SCALE = PANE_HEIGHT / 120

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from semdb.pipeline import Stage, overlapped
+from semdb.ingestion.pipeline import Stage, overlapped
 
 
 def test_results_keep_the_order_whatever_the_times() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from semdb.geometry import back_project, invert_pose, project, quat_wxyz_from_rotation, transform_points
-from semdb.keyframes import select_keyframes
+from semdb.ingestion.keyframes import select_keyframes
 from semdb.recordings import Recording, open_recording
 from semdb.recordings.images import decode_depth
 from semdb.types import Float32Array, FloatArray, Frame, ImageArray

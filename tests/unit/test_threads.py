@@ -12,8 +12,8 @@ import pytest
 
 from semdb.localization.localizer import LocalizerOptions
 from semdb.localization.pose import PoseOptions, estimate_pose, match_views
-from semdb.localization.threads import MOST, cores, each
 from semdb.localization.views import ClassNumbers
+from semdb.threads import MOST, cores, each
 from tests.unit.localization_scene import Scene
 
 

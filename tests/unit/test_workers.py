@@ -25,7 +25,7 @@ from semdb.errors import (
     SchemaError,
     UsageError,
 )
-from semdb.queueing import ChunkOutcome, Workplace
+from semdb.ingestion.queue import ChunkOutcome, Workplace
 from semdb.recordings.synthetic import SyntheticOptions, write_synthetic_recording
 from semdb.settings import Settings
 from semdb.workers import (

@@ -16,7 +16,7 @@ from semdb.localization.index.kernels import ByteArray, CodeArray, best_rows, cl
 from semdb.localization.index.reduction import Reduction
 from semdb.localization.index.vectors import Vectors
 from semdb.localization.ranking import best_first
-from semdb.localization.threads import each
+from semdb.threads import each
 from semdb.types import BoolArray, Float32Array, FloatArray, Int64Array, IntArray
 
 SMALL = 20_000  # rows below which threads cost more than they save

@@ -33,8 +33,8 @@ from semdb.errors import (
     UsageError,
 )
 from semdb.events import event
+from semdb.ingestion.pipeline import Stage, overlapped
 from semdb.perception.describe import Describer, View
-from semdb.pipeline import Stage, overlapped
 from semdb.recordings.base import FrameEntry, Recording
 from semdb.types import Description, Frame
 

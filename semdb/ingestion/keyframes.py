@@ -100,7 +100,7 @@ def _compare_views(
     recording: Recording, entries: Sequence[FrameEntry], progress: Progress | None
 ) -> tuple[list[FrameEntry], OverlapWith]:
     """Reads the depth of all `entries` once, and returns those that can be read and their comparison."""
-    from semdb.view_overlap import ViewStack, view_grid
+    from semdb.ingestion.view_overlap import ViewStack, view_grid
 
     readable, grids = [], []
     camera = recording.camera  # frames of quite another one are compared by their poses

@@ -13,30 +13,14 @@ import argparse
 import signal
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
-from bench.trust_fit import fitted
-from bench.trust_rows import Row, load_rows, make_row, report, save_plots, save_rows
-from bench.trust_suites import FIT, TEST, Query, Say, World, recorded_world, rendered_world
+from bench.trust.asking import ask_world
+from bench.trust.fit import fitted
+from bench.trust.rows import Row, load_rows, report, save_plots, save_rows
+from bench.trust.suites import FIT, TEST, recorded_world, rendered_world
 from semdb.cli.options import load_settings
-from semdb.database.store import Store
-from semdb.evaluation.workspace import evaluation_store
-from semdb.ingest import IngestOptions, ingest_recording
-from semdb.localization.localizer import Localizer, LocalizerOptions
-from semdb.localization.verdict import VerdictOptions
-from semdb.localize import make_localizer
-from semdb.model_choice import specs_for_ingest
-from semdb.perception.describe import Describer, describer_from_specs
-from semdb.refine import refine_map
-from semdb.settings import Settings
-
-# every pose is reported; the verdict is made afterwards, from the evidence, as a localizer makes it
-ALL_POSES = LocalizerOptions(verdict=replace(VerdictOptions(), ambiguous_inliers=0, ambiguous_first_inliers=0))
 
 
 def main() -> None:
@@ -85,49 +69,6 @@ def _ask_all(arguments: argparse.Namespace, work: Path) -> Iterator[Row]:
         yield from ask_world(
             recorded_world(arguments.recordings, _say), settings, arguments.every, arguments.first, _say
         )
-
-
-def ask_world(world: World, settings: Settings, every: int, first: int, say: Say) -> Iterator[Row]:
-    """Makes the maps of a world in a database of their own and asks its queries."""
-    with_masks = world.maps[0].recording.categories is not None
-    specs = specs_for_ingest(settings, (), has_masks=with_masks)
-    describer = describer_from_specs(specs.detector, specs.encoder, specs.features, settings)
-    with evaluation_store(settings.database_url) as store:
-        localizers = _make_maps(world, store, describer, say)
-        half = {plan.name: plan.half for plan in world.maps}
-        started, asked, said = time.perf_counter(), 0, 0
-        part = np.random.default_rng(0)  # in turn, with `every`, would favour what comes in turn
-        for query in world.queries():
-            if part.integers(every) != first:
-                continue
-            for row in _ask(world.name, query, describer, localizers, half):
-                asked += 1
-                yield row
-            if asked // 50 > said:
-                said = asked // 50
-                say(f"{world.name}: {asked} queries asked, {time.perf_counter() - started:.0f} s")
-
-
-def _make_maps(world: World, store: Store, describer: Describer, say: Say) -> dict[str, Localizer]:
-    made = {}
-    for plan in world.maps:
-        ingest_recording(
-            plan.recording, store, describer, IngestOptions(map_name=plan.name), entries=list(plan.entries)
-        )
-        refine_map(store, store.find_map(plan.name))
-        made[plan.name] = make_localizer(store, store.find_map(plan.name), "index", ALL_POSES)
-        say(f"map {plan.name}: {len(plan.entries)} keyframes")
-    return made
-
-
-def _ask(
-    world_name: str, query: Query, describer: Describer, localizers: dict[str, Localizer], half: dict[str, str]
-) -> Iterator[Row]:
-    picture = query.picture()
-    description = describer.describe(picture.image, None, picture.camera, picture.instances)
-    for asked in query.asked:
-        found = localizers[asked.map_name].localize(description)
-        yield make_row(world_name, query, asked, half[asked.map_name], found)
 
 
 if __name__ == "__main__":

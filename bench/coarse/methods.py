@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from sqlalchemy import bindparam, text
 
-from bench.coarse_fill import MAP_ID
-from bench.coarse_world import Query
+from bench.coarse.fill import MAP_ID
+from bench.coarse.world import Query
 from semdb.class_score import ClassQuery, class_query, strength_query
 from semdb.database.codecs import decode_vectors
 from semdb.database.store import Store

@@ -14,13 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.trust_images import SPOILED, Picture, Rng, close_up, no_place
-from semdb.keyframes import select_keyframes
+from bench.trust.images import SPOILED, Picture, Rng, close_up, no_place
+from semdb.ingestion.keyframes import select_keyframes
+from semdb.ingestion.view_overlap import ViewGrid, ViewStack, view_grid
 from semdb.recordings import open_recordings
 from semdb.recordings.base import FrameEntry, Recording
 from semdb.recordings.synthetic import SyntheticOptions, write_synthetic_recording
 from semdb.types import Camera, FloatArray, InstanceMasks
-from semdb.view_overlap import ViewGrid, ViewStack, view_grid
 
 POSITIVE, HARD, NEGATIVE = "positive", "hard", "negative"
 FIT, TEST = "fit", "test"

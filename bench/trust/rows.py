@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from bench.trust_suites import HARD, NEGATIVE, POSITIVE, TEST, Asked, Query
+from bench.trust.suites import HARD, NEGATIVE, POSITIVE, TEST, Asked, Query
 from semdb.evaluation.calibration import auroc, expected_calibration_error
 from semdb.evaluation.metrics import FALSE_ROTATION_DEG, FALSE_TRANSLATION_M
 from semdb.geometry import pose_error

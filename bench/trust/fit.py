@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import minimize
 
-from bench.trust_rows import Row, evidence_of
-from bench.trust_suites import FIT, POSITIVE, TEST
+from bench.trust.rows import Row, evidence_of
+from bench.trust.suites import FIT, POSITIVE, TEST
 from semdb.evaluation.calibration import auroc, expected_calibration_error
 from semdb.localization.confidence import FEATURES, confidence_features
 from semdb.localization.verdict import VerdictOptions, judge

@@ -2,7 +2,7 @@
 
     python -m bench.coarse [--keyframes 10000,100000] [--million] [--data-dir DIR] [--json FILE]
 
-Starts a MariaDB of its own, fills it with made-up keyframes (see bench/coarse_world.py), and asks every method the same
+Starts a MariaDB of its own, fills it with made-up keyframes (see bench/coarse/world.py), and asks every method the same
 queries in one run, on two threads. With --data-dir the filled server is kept for the next run: a million keyframes take
 20 GB. Times depend on the machine; the ratios, agreement and memory at the end hardly do.
 """
@@ -22,10 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from bench import coarse_methods as methods
-from bench.coarse_fill import MAP_ID, fill
-from bench.coarse_server import bench_server
-from bench.coarse_world import Query, World
+from bench.coarse import methods
+from bench.coarse.fill import MAP_ID, fill
+from bench.coarse.server import bench_server
+from bench.coarse.world import Query, World
 from semdb.cli.progress import Progress
 from semdb.database.store import Store, open_store
 from semdb.localization.index import IndexOptions, IndexSource, MapIndex
@@ -162,7 +162,7 @@ def time_to_find(url: str, index: MapIndex, seed: int) -> list[float]:
     return seconds
 
 
-PROBE = [sys.executable, "-m", "bench._coarse_probe"]
+PROBE = [sys.executable, "-m", "bench.coarse.probe"]
 
 
 def percentiles(milliseconds: list[float]) -> dict[str, float]:

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from semdb.compiled import kernel
-from semdb.fusion.options import DepthOptions
 from semdb.localization.bundle_kernels import depth_sigma
+from semdb.refinement.points.options import DepthOptions
 from semdb.types import FloatArray, Int64Array, IntArray
 
 CAUCHY = 4.0  # (2 sigma)^2: where the loss leaves the parabola

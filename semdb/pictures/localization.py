@@ -10,10 +10,10 @@ import numpy as np
 
 from semdb.database.store import Store
 from semdb.geometry import pose_error, transform_points
-from semdb.localize import ImageLocalization
-from semdb.pictures import category_colours, combine_pictures, draw_localization, localization_facts
+from semdb.localization.images import ImageLocalization
+from semdb.pictures.drawing import category_colours, combine_pictures, draw_localization, localization_facts
+from semdb.pictures.top_view import MapObject, draw_top_view
 from semdb.recordings import decode_color
-from semdb.top_view import MapObject, draw_top_view
 from semdb.types import Detection, ImageArray, Localization
 
 

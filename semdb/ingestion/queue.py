@@ -16,7 +16,7 @@ from semdb.database.planning import StoredPlan, check_models, stored_plan
 from semdb.database.requeue import requeue_failed
 from semdb.database.store import Store, open_store
 from semdb.errors import NotFoundError, RecordingUnavailableError, UsageError
-from semdb.ingest import (
+from semdb.ingestion.run import (
     IngestOptions,
     IngestSummary,
     Progress,
@@ -26,9 +26,9 @@ from semdb.ingest import (
     open_all,
     plan_ingest,
 )
-from semdb.item_work import Item, work_off
-from semdb.model_choice import ModelSpecs, settings_of_map, specs_for_ingest
+from semdb.ingestion.work import Item, work_off
 from semdb.perception.describe import Describer
+from semdb.perception.model_choice import ModelSpecs, settings_of_map, specs_for_ingest
 from semdb.recordings import open_recordings
 from semdb.recordings.base import Recording
 from semdb.recordings.source import locate, parse_source

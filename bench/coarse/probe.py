@@ -1,7 +1,7 @@
 """What the benchmark of the coarse step needs a fresh process for; prints JSON.
 
-``python -m bench._coarse_probe open URL CACHE KEYFRAMES SEED THREADS`` opens the index, asks it some queries, and says
-how long it took and how much memory it holds. ``python -m bench._coarse_probe write URL SEED`` stores a keyframe per
+``python -m bench.coarse.probe open URL CACHE KEYFRAMES SEED THREADS`` opens the index, asks it some queries, and says
+how long it took and how much memory it holds. ``python -m bench.coarse.probe write URL SEED`` stores a keyframe per
 line that it reads, says when it was committed, and deletes them all in the end.
 """
 
@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.coarse_fill import MAP_ID, MODELS
-from bench.coarse_methods import Source
-from bench.coarse_world import World
+from bench.coarse.fill import MAP_ID, MODELS
+from bench.coarse.methods import Source
+from bench.coarse.world import World
 from semdb.database.records import RecordingPlan
 from semdb.database.store import open_store
 from semdb.localization.index import IndexOptions, IndexSource, MapIndex

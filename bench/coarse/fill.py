@@ -13,7 +13,7 @@ import numpy as np
 import pymysql
 from sqlalchemy import insert
 
-from bench.coarse_world import CATEGORIES, LENGTH, World
+from bench.coarse.world import CATEGORIES, LENGTH, World
 from semdb.class_score import MOST_OBJECTS, UNITS
 from semdb.cli.progress import Progress
 from semdb.database import schema, tables

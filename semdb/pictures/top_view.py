@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse, Polygon
 from matplotlib.text import Text
 
-from semdb.pictures import FAINT, INK, VERDICT_COLOURS, Colour, blank_figure, category_colours, figure_to_image
+from semdb.pictures.drawing import FAINT, INK, VERDICT_COLOURS, Colour, blank_figure, category_colours, figure_to_image
 from semdb.types import FloatArray, ImageArray, Verdict
 
 KEYFRAME = "#9aa5b1"

@@ -1,7 +1,7 @@
 """The pipeline from a recording to rows: select keyframes, plan, describe, store. Called by the CLI and the workers.
 
 The plan is written before the first keyframe, each keyframe with all its children in one transaction, so a run
-that is cut off anywhere is finished by running it again. `semdb.item_work` does the work that is planned.
+that is cut off anywhere is finished by running it again. `semdb.ingestion.work` does the work that is planned.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from semdb.database.records import PlannedRecording, RecordingPlan
 from semdb.database.requeue import requeue_failed
 from semdb.database.store import Store, open_store
 from semdb.errors import UsageError
-from semdb.item_work import STAGES, Item, log_item, work_off
-from semdb.keyframes import select_keyframes
-from semdb.model_choice import ModelSpecs, settings_of_map, specs_for_ingest
+from semdb.ingestion.keyframes import select_keyframes
+from semdb.ingestion.work import STAGES, Item, log_item, work_off
 from semdb.perception.describe import Describer, describer_from_specs
+from semdb.perception.model_choice import ModelSpecs, settings_of_map, specs_for_ingest
 from semdb.recordings import open_recordings, parse_camera
 from semdb.recordings.base import DroppedFrame, FrameEntry, Recording
 from semdb.recordings.options import AS_THE_FORMAT_SAYS, ReadOptions
@@ -36,7 +36,7 @@ SECONDS_BETWEEN_LOOKS = 0.5  # at what other workers still have
 
 @dataclass(frozen=True, slots=True)
 class IngestOptions:
-    """`keyframes` and `stride` as in `semdb.keyframes.select_keyframes`; `name` overrides the recording's own.
+    """`keyframes` and `stride` as in `ingestion.keyframes.select_keyframes`; `name` overrides the recording's own.
 
     `map_name` None gives each recording the map of `default_map_name`. `camera` is the text of ``--camera``,
     `reading` says of the files what they do not say; `descriptor_dtype` is how descriptors of float are stored.

@@ -19,11 +19,11 @@ from semdb.database import point_rows, refinements
 from semdb.database.records import ClassConfusion, KeyframePoints, MapInfo, MapObject
 from semdb.database.store import Store
 from semdb.errors import DatabaseError, NotFoundError, UsageError
-from semdb.fusion.options import FusionOptions
 from semdb.geometry import transform_points
-from semdb.localization.confusion import ConfusionOptions, PlacedObjects, co_detections, confusions
 from semdb.localization.keyframe_cache import POINTS
 from semdb.localization.views import ClassNumbers, View, make_view
+from semdb.refinement.confusion import ConfusionOptions, PlacedObjects, co_detections, confusions
+from semdb.refinement.points.options import FusionOptions
 
 CLASSES = "classes"
 READ_CHUNK = 50
@@ -102,8 +102,8 @@ class PointStep:
 
     def compute(self, store: Store, map_id: int, progress: Callable[[int, int], None]) -> list[KeyframePoints]:
         """Raises NotFoundError where a keyframe is deleted meanwhile."""
-        from semdb.fusion.overlap import volume_of
-        from semdb.fusion.refined import refine_points
+        from semdb.refinement.points.overlap import volume_of
+        from semdb.refinement.points.refined import refine_points
 
         ids = [listed.id for listed in store.listed_keyframes(map_id)]
         numbers, volumes, counts = ClassNumbers(), [], []

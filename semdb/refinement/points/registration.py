@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semdb.fusion.options import RegistrationOptions
 from semdb.geometry import invert_pose, pose_from, so3_exp
 from semdb.localization.bundle import CAUCHY_SQUARED, NORMAL_MEDIAN
+from semdb.refinement.points.options import RegistrationOptions
 from semdb.types import FloatArray
 
 ITERATIONS = 8

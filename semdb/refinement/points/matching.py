@@ -16,11 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from semdb.compiled import kernel
-from semdb.fusion.options import GateOptions
 from semdb.geometry import invert_pose, transform_points
 from semdb.localization.adjustment import in_front
 from semdb.localization.matching import BACKGROUND, match_keypoints
 from semdb.localization.views import View
+from semdb.refinement.points.options import GateOptions
 from semdb.types import Float32Array, FloatArray, IntArray
 
 NEAREST_M, FARTHEST_M = 0.3, 20.0  # a point without depth is between

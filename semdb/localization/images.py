@@ -14,12 +14,12 @@ from semdb.errors import DatabaseError, FrameError, NotFoundError, ProvenanceErr
 from semdb.localization.index import IndexOptions, IndexSource, MapIndex
 from semdb.localization.keyframe_cache import STALE, KeyframeCache
 from semdb.localization.localizer import Localizer, LocalizerOptions
+from semdb.localization.query_image import LikeCamera, QueryImage, QueryReader
 from semdb.localization.sources import SqlSource
-from semdb.model_choice import settings_of_map, specs_for_query
 from semdb.perception.describe import Describer, describer_from_specs
-from semdb.query_image import LikeCamera, QueryImage, QueryReader
+from semdb.perception.model_choice import settings_of_map, specs_for_query
 from semdb.recordings import open_recordings
-from semdb.refine import CLASSES
+from semdb.refinement.run import CLASSES
 from semdb.settings import Settings
 from semdb.types import Camera, Description, Localization, Verdict
 

@@ -1,0 +1,1 @@
+"""What needs more than one keyframe: steps of `semdb refine` on the rows of a map."""
