@@ -16,7 +16,7 @@ from semdb.cli.completion.shells import BASH, ZSH, Shell, install
 from semdb.cli.main import COMMANDS, app
 from semdb.database.store import open_store
 from semdb.evaluation.methods import METHODS
-from semdb.refine import STEPS
+from semdb.refinement.run import STEPS
 from tests.database_samples import fill
 from tests.terminal import Terminal
 from tests.unit.test_cli import HEAVY
