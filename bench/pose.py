@@ -38,7 +38,8 @@ from semdb.geometry import invert_pose, pose_error, pose_from, so3_exp
 from semdb.ingestion.keyframes import select_keyframes
 from semdb.localization.bundle import pixel_sigma
 from semdb.localization.pairs import join_pairs, world_points_of
-from semdb.localization.pose import PoseOptions, estimate_pose, match_views
+from semdb.localization.pose import estimate_pose, match_views
+from semdb.localization.pose_options import PoseOptions
 from semdb.localization.views import ClassNumbers, KeyframeView, View, make_keyframe_view, make_view
 from semdb.perception.features.surf_features import SurfFeatures
 from semdb.perception.lifting import lift

@@ -187,3 +187,22 @@ def _strength_terms(
     return [
         ClassTerm(name, weight, weight * wanted, part) for part, wanted in zip(STRENGTHS, pair, strict=True) if wanted
     ]
+
+
+def expand(strengths: Mapping[str, int], weights: Mapping[str, Mapping[str, int]], share: float) -> dict[str, int]:
+    """`strengths` of a query's classes, and of the classes that these are taken for.
+
+    An object of class c stands for ``share * weight(c, d)`` of one of class d (`weights` in millionths); of what is
+    seen of a class itself and what others stand for the greater counts. Integers throughout.
+    """
+    thousandths = round(1000 * share)
+    stands: dict[str, int] = {}
+    for name, strength in strengths.items():
+        for other, weight in weights.get(name, {}).items():
+            stands[other] = stands.get(other, 0) + strength * weight * thousandths
+    result = dict(strengths)
+    for other, total in stands.items():
+        most = total // (1000 * SCALE)
+        if most > result.get(other, 0):
+            result[other] = most
+    return result

@@ -1,4 +1,8 @@
-"""Parts of one query side by side: compiled kernels leave the interpreter to other threads meanwhile."""
+"""Parts of one piece of work side by side: compiled kernels leave the interpreter to other threads meanwhile.
+
+The one pool of threads for all: local features, matching, the index. Work that runs on it must not wait for more work
+on it, so `each` is not called from within `each`.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +36,7 @@ def each(work: Callable[[Item], Result], items: Sequence[Item], threads: int) ->
 
 @lru_cache(maxsize=MOST)
 def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="semdb-query")
+    return ThreadPoolExecutor(threads, thread_name_prefix="semdb")
 
 
 if hasattr(os, "register_at_fork"):  # a forked process has the pool, but none of its threads

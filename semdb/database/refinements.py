@@ -19,6 +19,7 @@ from semdb.database.tables import categories, class_confusions, keyframes, maps,
 from semdb.errors import NotFoundError
 from semdb.geometry import pose_from, rotation_from_quat_wxyz
 
+CLASSES, POINTS = "classes", "points"  # kinds: steps of `semdb refine`
 CHUNK = 500
 WRITE_CHUNK = 2000
 _MICRO = 1_000_000

@@ -8,7 +8,7 @@ from semdb.errors import UsageError
 from semdb.localization.coarse import CoarseOptions, Scoring
 from semdb.localization.localizer import LocalizerOptions
 from semdb.localization.matching import Evidence, MatchingOptions
-from semdb.localization.pose import PoseOptions
+from semdb.localization.pose_options import PoseOptions
 from semdb.localization.verdict import VerdictOptions
 
 SEMDB = "semdb"

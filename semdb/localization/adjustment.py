@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,11 +10,9 @@ from semdb.geometry import invert_pose, transform_points
 from semdb.localization.alignment import Alignment
 from semdb.localization.bundle import BundleProblem, BundleResult, adjust, pixel_sigma
 from semdb.localization.pairs import NEAREST_M, Pairs
+from semdb.localization.pose_options import PoseOptions
 from semdb.localization.views import KeyframeView, View
 from semdb.types import BoolArray, FloatArray, IntArray
-
-if TYPE_CHECKING:
-    from semdb.localization.pose import PoseOptions
 
 
 def in_front(points: FloatArray) -> FloatArray:

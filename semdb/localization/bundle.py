@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from semdb.geometry import invert_pose, pose_distances
+from semdb.geometry.sensor import depth_noise
 from semdb.types import Float32Array, FloatArray, IntArray
 
 CAUCHY_SQUARED = 4.0  # (2 sigma)^2: where the loss leaves the parabola
@@ -179,7 +180,7 @@ class _Solver:
             if len(rows):
                 pose, depth = state.poses[image], self.problem.depth[rows]
                 z = state.points[self.problem.observed_point[rows]] @ pose[2, :3] + pose[2, 3]
-                excess = np.median(np.abs(z - depth) / (_depth_sigma(depth) * self.looser[rows])) * NORMAL_MEDIAN
+                excess = np.median(np.abs(z - depth) / (depth_noise(depth) * self.looser[rows])) * NORMAL_MEDIAN
                 self.observed[rows, 5] = self.looser[rows] * max(1.0, float(excess)) ** 2
 
     def reduced(self, blocks: _Blocks, damping: float) -> tuple[FloatArray, FloatArray]:
@@ -227,12 +228,6 @@ class _Solver:
                 if damping > 1e6:
                     break
         return state, blocks, iteration
-
-
-def _depth_sigma(depth: FloatArray) -> FloatArray:
-    from semdb.localization.bundle_kernels import depth_sigma
-
-    return np.asarray(depth_sigma(depth))  # type: ignore[arg-type]  # compiled: takes arrays too
 
 
 def adjust(

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from semdb.compiled import kernel
+from semdb.geometry.sensor_kernels import depth_sigma
 from semdb.types import FloatArray, IntArray
 
 PARAMETERS = 9  # of an image
@@ -19,15 +20,6 @@ RESIDUAL = 9  # where the residual is in it
 GREAT = 1e60  # a product greater than that is not to grow on
 # sums may be taken in another order, for vector instructions; what is no number stays none
 FAST = {"reassoc", "contract", "nsz", "arcp"}
-
-
-@kernel
-def depth_sigma(depth: float) -> float:
-    """Standard deviation in metres of a structured-light depth of `depth` metres.
-
-    The axial noise that Nguyen, Izadi and Lovell measured (3DIMPVT 2012): 0.0012 + 0.0019 (z - 0.4)^2.
-    """
-    return 0.0012 + 0.0019 * (depth - 0.4) ** 2
 
 
 @kernel(fastmath=FAST, forceinline=True)

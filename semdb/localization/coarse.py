@@ -14,9 +14,8 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Protocol
 
-from semdb.class_score import ClassQuery, class_query, strength_query
+from semdb.class_score import ClassQuery, class_query, expand, strength_query
 from semdb.localization.ranking import best_first
-from semdb.refinement.confusion import expand
 from semdb.types import Float32Array, FloatArray, Int64Array
 
 FOLLOWING = 30  # keyframes after those of a batch that are looked through for a place that looks the same

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from semdb.database.planning import check_models
 from semdb.database.records import MapInfo
+from semdb.database.refinements import CLASSES
 from semdb.database.store import Store
 from semdb.errors import DatabaseError, FrameError, NotFoundError, ProvenanceError, UsageError
 from semdb.localization.index import IndexOptions, IndexSource, MapIndex
@@ -19,7 +20,6 @@ from semdb.localization.sources import SqlSource
 from semdb.perception.describe import Describer, describer_from_specs
 from semdb.perception.model_choice import settings_of_map, specs_for_query
 from semdb.recordings import open_recordings
-from semdb.refinement.run import CLASSES
 from semdb.settings import Settings
 from semdb.types import Camera, Description, Localization, Verdict
 

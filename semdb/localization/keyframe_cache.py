@@ -11,15 +11,15 @@ import cv2
 import numpy as np
 
 from semdb.database.records import StoredKeyframe
+from semdb.database.refinements import POINTS
 from semdb.database.store import Store
 from semdb.errors import CodecError, NotFoundError
 from semdb.geometry import POSE_UNIT_M, pose_distances
+from semdb.geometry.sensor import depth_noise
 from semdb.localization.coarse import MapChange
 from semdb.localization.views import ClassNumbers, KeyframeView, make_keyframe_view
-from semdb.refinement.points.registration import depth_noise
 from semdb.types import Float32Array, FloatArray, ImageArray, Keypoints
 
-POINTS = "points"  # the step of `semdb refine`
 USED, STALE, NONE, OFF = "used", "stale", "none", "off"  # what becomes of its points
 
 

@@ -30,12 +30,12 @@ from semdb.localization.neighbours import by_side
 from semdb.localization.pose import (
     FirstPose,
     PoseEstimate,
-    PoseOptions,
     estimate_pose,
     first_pose,
     match_views,
     rival_pose,
 )
+from semdb.localization.pose_options import PoseOptions
 from semdb.localization.verdict import Judgement, VerdictOptions, convinces, judge
 from semdb.localization.views import KeyframeView, View, make_view
 from semdb.types import Candidate, Description, Float32Array, Localization, ModelInfo, Verdict

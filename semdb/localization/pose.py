@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,34 +12,18 @@ import poselib
 from semdb.geometry import invert_pose, pose_error, transform_points
 from semdb.localization.adjustment import bundle_adjust, in_front, project_adjusted, projected_error_px
 from semdb.localization.alignment import Alignment, align_pairs
-from semdb.localization.bundle import BundleResult, MotionPrior
+from semdb.localization.bundle import BundleResult
 from semdb.localization.matching import Matches, MatchingOptions, match_keypoints
 from semdb.localization.pairs import Pairs, guided_pairs, join_pairs, reprojection_px, world_points_of
+from semdb.localization.pose_options import PoseOptions
 from semdb.localization.views import KeyframeView, View
-from semdb.threads import cores, each
+from semdb.threads import each
 from semdb.types import BoolArray, FloatArray, IntArray
 
 MINIMUM_PAIRS = 6  # below, a pose from 3 points has nothing to be checked with
 RIVAL_SHARE = 0.2  # of the first inliers with the best keyframe: a rival with fewer says nothing and may be missed
 LEAST_RIVAL_ITERATIONS = 50
 MOST_RIVAL_ITERATIONS = 1000
-
-
-@dataclass(frozen=True, slots=True)
-class PoseOptions:
-    """Pixels are of the query image."""
-
-    matching: MatchingOptions = field(default_factory=MatchingOptions)
-    max_reprojection_px: float = 5.0
-    inlier_px: float = 4.0
-    close_radius_px: float = 6.0  # of guided matching once images' turns are known
-    pixel_sigma_px: float = 1.0  # of the finest keypoints
-    aligned_sigma_px: float = 0.35  # of one whose patch was aligned
-    guided: bool = True
-    bundle: bool = True
-    use_query_depth: bool = True
-    motion: MotionPrior = field(default_factory=MotionPrior)
-    threads: int = field(default_factory=cores)  # keyframes are worked on side by side
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ from typing import Any
 from semdb.errors import ModelError, UsageError
 from semdb.settings import Settings
 
+GPU_BATCH = 8  # images at once that keep a GPU busy
 _HASHES: dict[tuple[str, int, int], str] = {}
 
 
@@ -108,6 +109,8 @@ class OnnxModel:
             found = "; ".join(f"{i.name}: {i.type} {i.shape}" for i in inputs)
             raise ModelError(f"{path} must have one input, float32 [B, 3, H, W] RGB 0..1, but has {found}")
         self._input = inputs[0].name
+        self.takes_batches = inputs[0].shape[0] != 1  # a name or None where it is free
+        self.on_gpu = "CUDAExecutionProvider" in self._session.get_providers()
 
     def run(self, batch: Any) -> list[Any]:
         """The required outputs, in their order, for a float32 `batch` ``[B, 3, H, W]``. Raises ModelError."""

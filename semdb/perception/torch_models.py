@@ -14,11 +14,10 @@ import numpy.typing as npt
 
 from semdb.errors import ModelError, UsageError
 from semdb.perception.catalogue import BY_NAME
-from semdb.perception.model_files import first_line, models_dir, resolve_file
+from semdb.perception.model_files import GPU_BATCH, first_line, models_dir, resolve_file
 from semdb.settings import Settings
 
 INSTALL = "pip install 'semdb[torch]'"
-GPU_BATCH = 8
 _PICKLE, _ZIP = b"\x80", b"PK\x03\x04"  # how files of torch.save begin: the format of before torch 1.6, and today's
 
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from semdb.errors import RecordingError
-from semdb.recordings.base import DroppedFrame, FrameEntry, Recording, register_depth
+from semdb.recordings.base import DroppedFrame, FrameEntry, Recording
 from semdb.recordings.cameras import parse_camera
 from semdb.recordings.credentials import refuse_credentials
 from semdb.recordings.images import decode_color, decode_depth, read_depth_image, read_query_image
 from semdb.recordings.layouts import find_layout, not_a_recording, open_with
 from semdb.recordings.options import ReadOptions
+from semdb.recordings.registration import register_depth
 from semdb.types import Camera
 
 __all__ = [

@@ -8,9 +8,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from semdb.errors import FrameError, RecordingError
-from semdb.recordings.base import DroppedFrame, FrameData, FrameEntry, Recording, depth_size
+from semdb.recordings.base import DroppedFrame, FrameData, FrameEntry, Recording
 from semdb.recordings.cameras import with_size
 from semdb.recordings.images import ImageHeader, inspect_file
+from semdb.recordings.registration import depth_size
 from semdb.types import Camera
 
 

@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 
 from semdb.errors import FrameError
-from semdb.recordings.cameras import SEVEN_SCENES_DEPTH
 from semdb.recordings.images import (
     decode_16bit,
     decode_color,
@@ -22,9 +21,8 @@ from semdb.recordings.images import (
     scaled_depth,
 )
 from semdb.recordings.options import ReadOptions
+from semdb.recordings.registration import depth_size, register_depth
 from semdb.types import Camera, Float32Array, FloatArray, Frame, ImageArray, InstanceMasks
-
-REGISTRATION_7SCENES = "7scenes"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,27 +83,6 @@ class DroppedFrame:
 
     name: str
     reason: str
-
-
-def depth_size(camera: Camera, registration: str) -> tuple[int, int]:
-    """Width and height that depth files must have: of the depth camera where one registers, else of `camera`."""
-    if registration == REGISTRATION_7SCENES:
-        return SEVEN_SCENES_DEPTH.width, SEVEN_SCENES_DEPTH.height
-    return camera.width, camera.height
-
-
-def register_depth(depth: Float32Array, registration: str, camera: Camera) -> Float32Array:
-    """Depth as `decode_depth` gives it, registered to the colour `camera` as `registration` names ("" does nothing).
-
-    Raises FrameError for a registration of another version.
-    """
-    if registration == "":
-        return depth
-    if registration != REGISTRATION_7SCENES:
-        raise FrameError(f"unknown depth registration {registration!r}; known are '' and {REGISTRATION_7SCENES!r}")
-    from semdb.recordings.registration import register_seven_scenes
-
-    return register_seven_scenes(depth, camera)
 
 
 @dataclass(slots=True, eq=False)

@@ -1,4 +1,4 @@
-"""Depth of 7-Scenes' depth camera as its colour camera would see it.
+"""Depth of a depth camera as the colour camera beside it would see it; `REGISTRATIONS` knows such pairs by name.
 
 Neighbouring depth pixels of one surface are joined to triangles, which are moved into the colour camera and
 rasterised with a z-buffer. Against moving single pixels this leaves no cracks through which the background
@@ -11,26 +11,67 @@ the step, so no surface is invented between foreground and background; what the 
 # mypy: disable-error-code="no-untyped-call"
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
-from semdb.compiled import kernel
-from semdb.geometry import back_project, normalized_to_pixels
+from semdb.errors import FrameError
+from semdb.geometry import back_project, invert_pose, normalized_to_pixels, pose_from, project_to_so3
 from semdb.recordings.cameras import SEVEN_SCENES_DEPTH
-from semdb.recordings.seven_scenes import COLOR_FROM_DEPTH
 from semdb.types import Camera, Float32Array
 
+REGISTRATION_7SCENES = "7scenes"
+# The depth-to-colour calibration that ACE's set-up of 7-Scenes uses, its rotation made exact; metres.
+COLOR_FROM_DEPTH = pose_from(
+    project_to_so3(
+        [
+            [0.99996518, 0.00267651, -0.0079041],
+            [-0.00274093, 0.99996303, -0.00815045],
+            [0.00788199, 0.00817183, 0.99993555],
+        ]
+    ),
+    [-0.02555894, 0.00010110, 0.00203183],
+)
+DEPTH_FROM_COLOR = invert_pose(COLOR_FROM_DEPTH)
 # Neighbours further apart than this share of their depth are two surfaces: a Kinect's step is below 1.5 % of the
 # depth up to 5 m, a floor seen at 10 degrees changes by 1 % a pixel.
 MAX_STEP = 0.03
-TOLERANCE = np.float32(-1e-4)  # a pixel centre on the edge of two triangles belongs to one of them at least
 BAND = 64  # rows at a time: what is computed of them stays in the processor's cache
-NONE, SEVERAL = np.int32(-1), np.int32(-2)  # how many pixels a triangle may see, where it is not one
+
+
+@dataclass(frozen=True, slots=True)
+class Registration:
+    """How depth files of one pair of cameras are brought to the colour image: `size` (width, height) of the files."""
+
+    size: tuple[int, int]
+    register: Callable[[Float32Array, Camera], Float32Array]
+
+
+def depth_size(camera: Camera, registration: str) -> tuple[int, int]:
+    """Width and height that depth files must have: of the depth camera where one registers, else of `camera`."""
+    found = REGISTRATIONS.get(registration)
+    return (camera.width, camera.height) if found is None else found.size
+
+
+def register_depth(depth: Float32Array, registration: str, camera: Camera) -> Float32Array:
+    """Depth as `decode_depth` gives it, registered to the colour `camera` as `registration` names ("" does nothing).
+
+    Raises FrameError for a registration of another version.
+    """
+    if registration == "":
+        return depth
+    if registration not in REGISTRATIONS:
+        known = ", ".join(map(repr, ("", *REGISTRATIONS)))
+        raise FrameError(f"unknown depth registration {registration!r}; known are {known}")
+    return REGISTRATIONS[registration].register(depth, camera)
 
 
 def register_seven_scenes(depth: Float32Array, camera: Camera) -> Float32Array:
     """Depth ``[480, 640]`` metres of the depth camera (NaN invalid) as seen by the colour `camera` ``[H, W]``."""
+    from semdb.recordings.registration_kernels import invert, rasterise, transform  # numba: half a second to import
+
     shift, rays = COLOR_FROM_DEPTH[:3, 3].astype(np.float32), _rotated_rays()
     distorted = any(camera.distortion)
     lens = (1.0, 1.0, 0.0, 0.0) if distorted else (camera.fx, camera.fy, camera.cx, camera.cy)
@@ -40,13 +81,13 @@ def register_seven_scenes(depth: Float32Array, camera: Camera) -> Float32Array:
     for top in range(0, len(depth) - 1, BAND):
         part = depth[top : top + BAND + 1]
         u, v, inverse_z, known = np.empty((4, *part.shape), dtype=np.float32)
-        _transform(part, rays[top : top + BAND + 1], shift, fx, fy, cx, cy, u, v, inverse_z, known)
+        transform(part, rays[top : top + BAND + 1], shift, fx, fy, cx, cy, u, v, inverse_z, known)
         if distorted:
             pixels = normalized_to_pixels(camera, np.column_stack([u.ravel(), v.ravel()]).astype(np.float64))
             u = pixels[:, 0].reshape(part.shape).astype(np.float32)
             v = pixels[:, 1].reshape(part.shape).astype(np.float32)
-        _rasterise(known, u, v, inverse_z, np.float32(MAX_STEP), nearest)
-    _invert(nearest)
+        rasterise(known, u, v, inverse_z, np.float32(MAX_STEP), nearest)
+    invert(nearest)
     return nearest
 
 
@@ -60,121 +101,6 @@ def _rotated_rays() -> Float32Array:  # [480, 3, 640]
     return np.ascontiguousarray(turned.transpose(0, 2, 1), dtype=np.float32)
 
 
-@kernel
-def _transform(  # type: ignore[no-untyped-def]  # pragma: no cover
-    depth, rays, shift, fx, fy, cx, cy, u, v, inverse_z, known
-):
-    """Where each depth pixel is in the other camera, in pixels, and 1/z; `known` is `depth`, 0 for NaN."""
-    for row in range(depth.shape[0]):
-        for column in range(depth.shape[1]):
-            d = depth[row, column]
-            w = np.float32(1) / (d * rays[row, 2, column] + shift[2])
-            x = (d * rays[row, 0, column] + shift[0]) * w
-            y = (d * rays[row, 1, column] + shift[1]) * w
-            u[row, column] = x * fx + cx
-            v[row, column] = y * fy + cy
-            inverse_z[row, column] = w
-            known[row, column] = d if d > 0 else np.float32(0)
-
-
-@kernel(fastmath=True)
-def _rasterise(depth, u, v, inverse_z, max_step, nearest):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Both triangles of each 2x2 block: the diagonal from top right to bottom left is shared."""
-    rows, columns = depth.shape
-    flat = nearest.reshape(nearest.size)
-    place, value = np.empty(columns, np.int32), np.empty(columns, np.float32)
-    for row in range(rows - 1):
-        for half in range(2):
-            several = _triangles_of_row(depth, u, v, inverse_z, max_step, row, half, nearest.shape, place, value)
-            if several:
-                for c in range(columns - 1):
-                    if place[c] == SEVERAL:
-                        r0, c0 = row + half, c + half
-                        r1, c1 = row + half, c + 1 - half
-                        r2, c2 = row + 1 - half, c + half
-                        _triangle(
-                            u[r0, c0], v[r0, c0], inverse_z[r0, c0],
-                            u[r1, c1], v[r1, c1], inverse_z[r1, c1],
-                            u[r2, c2], v[r2, c2], inverse_z[r2, c2],
-                            nearest,
-                        )  # fmt: skip
-            found = 0
-            for c in range(columns - 1):  # whether a triangle has a pixel cannot be foreseen: no branch
-                place[found], value[found] = place[c], value[c]
-                found += place[c] >= 0
-            for k in range(found):
-                p = np.uintp(place[k])
-                flat[p] = max(flat[p], value[k])
-
-
-@kernel(fastmath={"contract"})
-def _triangles_of_row(  # type: ignore[no-untyped-def]  # pragma: no cover
-    depth, u, v, inverse_z, max_step, row, half, size, place, value
-):
-    """What `_triangle` does, for one triangle of each block of a row, many at a time: nearly all see at most one pixel.
-
-    Writes the flat index of that pixel to `place`, NONE where there is none, SEVERAL where there may be more, and its
-    1/z to `value`. Returns how many are SEVERAL. Rounds as `_triangle` does to the last bit:
-    hence `contract` and no more, and the sign of `share_c`.
-    """
-    height, width = size
-    last_x, last_y = np.float32(width - 1), np.float32(height - 1)
-    columns = depth.shape[1]
-    flat_depth, flat_u, flat_v, flat_w = depth.ravel(), u.ravel(), v.ravel(), inverse_z.ravel()
-    begin = row * columns + half
-    a, b = np.uintp(begin + half * columns), np.uintp(begin + half * columns + 1 - 2 * half)
-    c = np.uintp(begin + (1 - half) * columns)
-    several = np.int32(0)  # as wide as everything else: a wider number would halve how many go at a time
-    for k in range(columns - 1):
-        x = np.uintp(k)
-        ua, ub, uc = flat_u[a + x], flat_u[b + x], flat_u[c + x]
-        va, vb, vc = flat_v[a + x], flat_v[b + x], flat_v[c + x]
-        wa, wb, wc = flat_w[a + x], flat_w[b + x], flat_w[c + x]
-        low = min(flat_depth[a + x], flat_depth[b + x], flat_depth[c + x])
-        high = max(flat_depth[a + x], flat_depth[b + x], flat_depth[c + x])
-        area = (ub - ua) * (vc - va) - (vb - va) * (uc - ua)
-        left, right = max(np.float32(0), np.ceil(min(ua, ub, uc))), min(last_x, np.floor(max(ua, ub, uc)))
-        top, bottom = max(np.float32(0), np.ceil(min(va, vb, vc))), min(last_y, np.floor(max(va, vb, vc)))
-        used = (low > 0) & (high - low <= max_step * low) & (area > 0) & (left <= right) & (top <= bottom)
-        single = (left == right) & (top == bottom)
-        dx, dy = left - ua, top - va
-        share_b = (dx * (vc - va) - dy * (uc - ua)) * (np.float32(1) / area)
-        share_c = ((vb - va) * dx - (ub - ua) * dy) * (np.float32(-1) / area)
-        inside = (min(share_b, share_c) >= TOLERANCE) & (share_b + share_c <= np.float32(1) - TOLERANCE)
-        value[x] = wa + share_b * (wb - wa) + share_c * (wc - wa)
-        pixel = np.int32(np.int32(np.int32(top) * np.int32(width)) + np.int32(left))
-        place[x] = (pixel if inside else NONE) if used & single else (SEVERAL if used else NONE)
-        several = np.int32(several + np.int32(used & ~single))
-    return several
-
-
-@kernel(fastmath=True, inline="always")
-def _triangle(ua, va, wa, ub, vb, wb, uc, vc, wc, nearest):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Writes 1/z of one triangle where it is the nearest surface; pixel centres are whole numbers."""
-    area = (ub - ua) * (vc - va) - (vb - va) * (uc - ua)
-    if not area > 0:
-        return  # seen from behind, or without extent
-    height, width = nearest.shape
-    left, right = max(0, int(np.ceil(min(ua, ub, uc)))), min(width - 1, int(np.floor(max(ua, ub, uc))))
-    top, bottom = max(0, int(np.ceil(min(va, vb, vc)))), min(height - 1, int(np.floor(max(va, vb, vc))))
-    if left > right or top > bottom:
-        return  # between pixel centres
-    scale = np.float32(1) / area
-    for y in range(top, bottom + 1):
-        for x in range(left, right + 1):
-            dx, dy = np.float32(x) - ua, np.float32(y) - va
-            share_b = (dx * (vc - va) - dy * (uc - ua)) * scale
-            share_c = ((ub - ua) * dy - (vb - va) * dx) * scale
-            if min(share_b, share_c) < TOLERANCE or share_b + share_c > np.float32(1) - TOLERANCE:
-                continue
-            w = wa + share_b * (wb - wa) + share_c * (wc - wa)
-            nearest[y, x] = max(nearest[y, x], w)
-
-
-@kernel
-def _invert(nearest):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """1/z becomes z, what is not known NaN."""
-    for row in range(nearest.shape[0]):
-        for column in range(nearest.shape[1]):
-            w = nearest[row, column]
-            nearest[row, column] = np.float32(1) / w if w > 0 else np.float32(np.nan)
+REGISTRATIONS = {
+    REGISTRATION_7SCENES: Registration((SEVEN_SCENES_DEPTH.width, SEVEN_SCENES_DEPTH.height), register_seven_scenes)
+}

@@ -13,27 +13,16 @@ from pathlib import Path
 import numpy as np
 
 from semdb.errors import RecordingError
-from semdb.geometry import invert_pose, pose_from, project_to_so3
+from semdb.geometry import pose_from, project_to_so3
 from semdb.recordings.assembly import Draft, finish, no_usable_frame
-from semdb.recordings.base import REGISTRATION_7SCENES, DroppedFrame, FrameEntry, Layout, Recording
+from semdb.recordings.base import DroppedFrame, FrameEntry, Layout, Recording
 from semdb.recordings.cameras import SEVEN_SCENES_COLOR, SEVEN_SCENES_DEPTH_SCALE
 from semdb.recordings.options import ReadOptions
+from semdb.recordings.registration import DEPTH_FROM_COLOR, REGISTRATION_7SCENES
 from semdb.types import Camera, FloatArray
 
 FRAME_FILE = re.compile(r"frame-(\d+)\.(color\.png|color\.jpg|color\.jpeg|depth\.png|pose\.txt)")
 SEQUENCE = re.compile(r"seq-?\d+")
-# The depth-to-colour calibration that ACE's set-up of 7-Scenes uses, its rotation made exact; metres.
-COLOR_FROM_DEPTH = pose_from(
-    project_to_so3(
-        [
-            [0.99996518, 0.00267651, -0.0079041],
-            [-0.00274093, 0.99996303, -0.00815045],
-            [0.00788199, 0.00817183, 0.99993555],
-        ]
-    ),
-    [-0.02555894, 0.00010110, 0.00203183],
-)
-DEPTH_FROM_COLOR = invert_pose(COLOR_FROM_DEPTH)
 ROTATION_TOLERANCE = 0.02  # published poses are off by up to 4e-4
 
 

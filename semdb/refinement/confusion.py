@@ -7,7 +7,6 @@ a class goes by another name is how far a query's object of the one may stand fo
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -97,22 +96,3 @@ def confusions(counts: Int64Array, options: ConfusionOptions | None = None) -> l
         if a != b and weight >= options.minimum_weight * MILLION:
             found.append(Confusion(a, b, int(counts[a, b]), weight))
     return found
-
-
-def expand(strengths: Mapping[str, int], weights: Mapping[str, Mapping[str, int]], share: float) -> dict[str, int]:
-    """`strengths` of a query's classes, and of the classes that these are taken for.
-
-    An object of class c stands for ``share * weight(c, d)`` of one of class d (`weights` in millionths); of what is
-    seen of a class itself and what others stand for the greater counts. Integers throughout.
-    """
-    thousandths = round(1000 * share)
-    stands: dict[str, int] = {}
-    for name, strength in strengths.items():
-        for other, weight in weights.get(name, {}).items():
-            stands[other] = stands.get(other, 0) + strength * weight * thousandths
-    result = dict(strengths)
-    for other, total in stands.items():
-        most = total // (1000 * MILLION)
-        if most > result.get(other, 0):
-            result[other] = most
-    return result

@@ -12,11 +12,13 @@ from sqlalchemy import Connection, text
 from sqlalchemy.exc import IntegrityError
 
 from semdb.database.records import ClassConfusion, MapInfo
+from semdb.database.refinements import CLASSES
 from semdb.database.store import Store, open_store
 from semdb.errors import DatabaseError, NotFoundError, UsageError
 from semdb.geometry import invert_pose, transform_points
 from semdb.refinement import run as refine
-from semdb.refinement.run import CLASSES, ClassStep, StepResult
+from semdb.refinement.class_step import ClassStep
+from semdb.refinement.run import StepResult
 from semdb.types import Description, ObjectGeometry
 from tests.database_samples import MODELS, description, plan, pose, record
 

@@ -14,11 +14,12 @@ from semdb.cli.status import refinements_of
 from semdb.database import point_rows
 from semdb.database.codecs import encode_array
 from semdb.database.records import KeyframePoints, KeyframeRecord, MapInfo
+from semdb.database.refinements import POINTS
 from semdb.database.store import Store, open_store
 from semdb.errors import CodecError
 from semdb.geometry import pose_from, so3_exp
 from semdb.localization.images import make_localizer
-from semdb.localization.keyframe_cache import POINTS, KeyframeCache
+from semdb.localization.keyframe_cache import KeyframeCache
 from semdb.localization.localizer import LocalizerOptions
 from semdb.refinement.run import refine_map
 from semdb.types import Description, FloatArray, Keypoints

@@ -13,13 +13,16 @@ Shape = Sequence[int | str]
 
 
 def write_constant_model(
-    path: Path, outputs: Mapping[str, npt.NDArray[np.generic]], metadata: Mapping[str, str] | None = None
+    path: Path,
+    outputs: Mapping[str, npt.NDArray[np.generic]],
+    metadata: Mapping[str, str] | None = None,
+    batch: int | str = "B",
 ) -> Path:
-    """A model that gives `outputs` whatever the image is."""
+    """A model that gives `outputs` whatever the image is; `batch` is how many it takes at once, a name for any."""
     nodes = [_node("Identity", [f"{name}_value"], [name]) for name in outputs]
     tensors = [_tensor(f"{name}_value", value) for name, value in outputs.items()]
     declared = {name: (_type_of(value), value.shape) for name, value in outputs.items()}
-    return _write(path, nodes, tensors, declared, metadata)
+    return _write(path, nodes, tensors, declared, metadata, batch)
 
 
 def write_mean_embedding_model(path: Path) -> Path:
@@ -51,10 +54,11 @@ def _write(
     tensors: list[bytes],
     outputs: Mapping[str, tuple[int, Shape]],
     metadata: Mapping[str, str] | None,
+    batch: int | str = "B",
 ) -> Path:
     graph = b"".join(_field(1, node) for node in nodes) + _field(2, b"tiny")
     graph += b"".join(_field(5, tensor) for tensor in tensors)
-    graph += _field(11, _value_info("image", _FLOAT, ("B", 3, "H", "W")))
+    graph += _field(11, _value_info("image", _FLOAT, (batch, 3, "H", "W")))
     graph += b"".join(_field(12, _value_info(name, *declared)) for name, declared in outputs.items())
     model = _field(1, 8) + _field(7, graph) + _field(8, _field(1, b"") + _field(2, 17))
     for key, value in (metadata or {}).items():

@@ -10,7 +10,7 @@ import numpy as np
 
 from semdb.geometry import back_project, invert_pose, pose_from, quat_wxyz_from_rotation, so3_exp
 from semdb.recordings.cameras import SEVEN_SCENES_COLOR, SEVEN_SCENES_DEPTH
-from semdb.recordings.seven_scenes import COLOR_FROM_DEPTH
+from semdb.recordings.registration import COLOR_FROM_DEPTH
 from semdb.types import Camera, Float32Array, FloatArray, ImageArray
 
 SMALL = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)

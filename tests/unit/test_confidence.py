@@ -15,7 +15,8 @@ from semdb.localization.confidence import (
     confidence_of,
     gather_evidence,
 )
-from semdb.localization.pose import PoseEstimate, PoseOptions, estimate_pose, match_view
+from semdb.localization.pose import PoseEstimate, estimate_pose, match_view
+from semdb.localization.pose_options import PoseOptions
 from semdb.localization.views import ClassNumbers, KeyframeView, View
 from tests.unit.localization_scene import Scene
 from tests.unit.test_verdict import EVIDENCE

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from semdb.refinement.confusion import Confusion, ConfusionOptions, PlacedObjects, co_detections, confusions, expand
+from semdb.class_score import expand
+from semdb.refinement.confusion import Confusion, ConfusionOptions, PlacedObjects, co_detections, confusions
 
 BED, COUCH, CUP = 0, 1, 2
 

@@ -10,6 +10,7 @@ import pytest
 from semdb.errors import ModelError, UsageError
 from semdb.perception.encoders import load_encoder
 from semdb.perception.encoders.gist import GistEncoder
+from semdb.perception.protocols import BatchEncoder
 from semdb.settings import Settings
 from tests.unit.onnx_files import write_constant_model, write_mean_embedding_model
 
@@ -179,3 +180,22 @@ def test_gist_retrieves_places(shared_dir: Path) -> None:
         for q, k in zip(queries, best, strict=True)
     ]
     assert np.mean(np.array(excess) < 1) >= 0.95
+
+
+def test_several_images_at_once_give_what_each_gives_alone(tmp_path: Path) -> None:
+    encoder = load_encoder(f"onnx:{write_mean_embedding_model(tmp_path / 'mean.onnx')}", SETTINGS)
+    assert isinstance(encoder, BatchEncoder)
+    assert encoder.best_batch == 1  # on a processor it brings nothing
+    images = [noise(seed, *size) for seed, size in enumerate([(48, 64), (300, 260), (480, 640)])]
+    vectors = encoder.encode_batch(images)
+    assert vectors.shape == (3, 3)
+    assert vectors.dtype == np.float32
+    np.testing.assert_allclose(vectors, [encoder.encode(image) for image in images], atol=1e-6)
+    assert np.abs(vectors[0] - vectors[1]).max() > 1e-4
+
+
+def test_a_network_for_one_image_at_a_time_gets_one_at_a_time(tmp_path: Path) -> None:
+    path = write_constant_model(tmp_path / "one.onnx", {"embedding": np.array([[3, 4]], np.float32)}, batch=1)
+    encoder = load_encoder(f"onnx:{path}", SETTINGS)
+    assert isinstance(encoder, BatchEncoder)
+    np.testing.assert_allclose(encoder.encode_batch([noise(0), noise(1)]), [[0.6, 0.8]] * 2, atol=1e-6)

@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from semdb.geometry import pose_error
-from semdb.localization.bundle_kernels import depth_sigma
+from semdb.geometry.sensor_kernels import depth_sigma
 from semdb.localization.matching import Evidence, MatchingOptions
-from semdb.localization.pose import PoseOptions, _iterations_for, estimate_pose, first_pose, match_view, rival_pose
+from semdb.localization.pose import _iterations_for, estimate_pose, first_pose, match_view, rival_pose
+from semdb.localization.pose_options import PoseOptions
 from semdb.localization.views import ClassNumbers, make_keyframe_view
 from tests.unit.localization_scene import CAMERA, DISTORTED, Scene
 

@@ -10,7 +10,7 @@ from semdb.errors import FrameError
 from semdb.geometry import back_project
 from semdb.recordings import register_depth
 from semdb.recordings.cameras import SEVEN_SCENES_COLOR, SEVEN_SCENES_DEPTH
-from semdb.recordings.seven_scenes import COLOR_FROM_DEPTH, DEPTH_FROM_COLOR
+from semdb.recordings.registration import COLOR_FROM_DEPTH, DEPTH_FROM_COLOR
 from semdb.types import Camera, Float32Array, FloatArray
 
 # in the depth camera's frame: a board of 0.6 x 0.5 m at z = 1 before a slanted wall

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from semdb.localization.localizer import LocalizerOptions
-from semdb.localization.pose import PoseOptions, estimate_pose, match_views
+from semdb.localization.pose import estimate_pose, match_views
+from semdb.localization.pose_options import PoseOptions
 from semdb.localization.views import ClassNumbers
 from semdb.threads import MOST, cores, each
 from tests.unit.localization_scene import Scene

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semdb.errors import ModelError
-from semdb.perception.model_files import OnnxModel, canonical_json, file_sha256, resolve_onnx
+from semdb.perception.model_files import GPU_BATCH, OnnxModel, canonical_json, file_sha256, resolve_onnx
 from semdb.settings import Settings
 from semdb.types import Float32Array, ImageArray, ModelInfo
 
@@ -25,6 +26,7 @@ class OnnxEncoder:
         path = resolve_onnx(spec, settings)
         self._model = OnnxModel(path, settings.threads, ("embedding",), settings.device)
         config = canonical_json({"crop": CROP, "short_side": SHORT_SIDE})
+        self.best_batch = GPU_BATCH if self._model.on_gpu and self._model.takes_batches else 1
         self.info = ModelInfo("encoder", f"onnx:{path.name}", file_sha256(path), config)
 
     def encode(self, image: ImageArray) -> Float32Array:
@@ -32,10 +34,24 @@ class OnnxEncoder:
 
         Raises ModelError when the network fails or its embedding is not ``[1, d]``, not finite or zero.
         """
-        (embedding,) = self._model.run(centre_batch(image))
-        if embedding.ndim != 2 or embedding.shape[0] != 1:
-            raise ModelError(f"{self._model.path}: embedding is {embedding.shape} for one image; wanted is [1, d]")
-        return unit_vector(embedding[0], self._model.path)
+        vector: Float32Array = self._run([image])[0]
+        return vector
+
+    def encode_batch(self, images: Sequence[ImageArray]) -> Float32Array:
+        """The vectors of `images` (of any sizes) float32 ``[n, d]``, each as `encode` gives it, within rounding.
+
+        Raises ModelError. A network that is made for one image at a time gets one at a time.
+        """
+        if self._model.takes_batches:
+            return self._run(images)
+        return np.concatenate([self._run([image]) for image in images])
+
+    def _run(self, images: Sequence[ImageArray]) -> Float32Array:
+        (embedding,) = self._model.run(np.concatenate([centre_batch(image) for image in images]))
+        if embedding.ndim != 2 or embedding.shape[0] != len(images):
+            count, wanted = "one image" if len(images) == 1 else f"{len(images)} images", f"[{len(images)}, d]"
+            raise ModelError(f"{self._model.path}: embedding is {embedding.shape} for {count}; wanted is {wanted}")
+        return np.stack([unit_vector(row, self._model.path) for row in embedding])
 
 
 def unit_vector(embedding: npt.NDArray[np.floating[Any]], path: Path) -> Float32Array:

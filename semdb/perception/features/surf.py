@@ -11,10 +11,8 @@ results are those of OpenCV's implementation (`docs/surf.md` compares them); the
 from __future__ import annotations
 
 import math
-import os
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -26,6 +24,7 @@ import numpy.typing as npt
 
 from semdb.errors import UsageError
 from semdb.perception.features._surf_levels import PART_COLUMNS, PART_ROWS, Level, level_keys, level_of, level_parts
+from semdb.threads import each
 from semdb.types import BoolArray, Features, Float32Array, ImageArray, IntArray
 
 UPRIGHT_ANGLE = 270.0  # what OpenCV gives upright keypoints
@@ -85,9 +84,6 @@ class SURF:
         self.smoothing = float(smoothing)
         self.max_keypoints = int(max_keypoints)
         self.threads = int(threads)
-        self._pool: ThreadPoolExecutor | None = None
-        self._pool_process = 0
-        self._pool_lock = threading.Lock()
         self._scratch = _Scratch()
         self._largest = (9 + 6 * (self.n_octave_layers + 1)) << (self.n_octaves - 1)
 
@@ -278,13 +274,7 @@ class SURF:
         return [partial(run, a, b) for a, b in _shares(len(keys), 1 if self.threads == 1 else len(keys))]
 
     def _run(self, tasks: Sequence[Callable[[], Any]]) -> list[Any]:
-        if self.threads == 1 or len(tasks) < 2:
-            return [task() for task in tasks]
-        with self._pool_lock:
-            if self._pool is None or self._pool_process != os.getpid():  # threads do not survive a fork
-                self._pool = ThreadPoolExecutor(self.threads, thread_name_prefix="surf")
-                self._pool_process = os.getpid()
-        return [future.result() for future in [self._pool.submit(task) for task in tasks]]
+        return each(lambda task: task(), tasks, self.threads)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from semdb.geometry import invert_pose, pose_from, so3_exp
+from semdb.geometry.sensor import depth_noise
 from semdb.localization.bundle import CAUCHY_SQUARED, NORMAL_MEDIAN
 from semdb.refinement.points.options import RegistrationOptions
 from semdb.types import FloatArray
@@ -190,10 +191,3 @@ def _image_rows(
     project[:, 0, 0], project[:, 1, 1] = 1 / z, 1 / z
     project[:, 0, 2], project[:, 1, 2] = -x / z**2, -y / z**2
     return project @ by_step / sigma, residual
-
-
-def depth_noise(depth: FloatArray) -> FloatArray:
-    """Standard deviation in metres ``[n]`` of measured depths ``[n]`` (`bundle_kernels.depth_sigma`)."""
-    from semdb.localization.bundle_kernels import depth_sigma
-
-    return np.asarray(depth_sigma(depth), np.float64)  # type: ignore[arg-type]  # compiled: takes arrays too

@@ -1,0 +1,26 @@
+"""What can be varied in the fine step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from semdb.localization.bundle import MotionPrior
+from semdb.localization.matching import MatchingOptions
+from semdb.threads import cores
+
+
+@dataclass(frozen=True, slots=True)
+class PoseOptions:
+    """Pixels are of the query image."""
+
+    matching: MatchingOptions = field(default_factory=MatchingOptions)
+    max_reprojection_px: float = 5.0
+    inlier_px: float = 4.0
+    close_radius_px: float = 6.0  # of guided matching once images' turns are known
+    pixel_sigma_px: float = 1.0  # of the finest keypoints
+    aligned_sigma_px: float = 0.35  # of one whose patch was aligned
+    guided: bool = True
+    bundle: bool = True
+    use_query_depth: bool = True
+    motion: MotionPrior = field(default_factory=MotionPrior)
+    threads: int = field(default_factory=cores)  # keyframes are worked on side by side

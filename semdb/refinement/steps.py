@@ -1,0 +1,9 @@
+"""The steps of `semdb refine`, in the order in which they are run."""
+
+from __future__ import annotations
+
+from semdb.refinement.class_step import ClassStep
+from semdb.refinement.point_step import PointStep
+from semdb.refinement.step import Step
+
+STEPS: tuple[Step, ...] = (ClassStep(), PointStep())
