@@ -202,6 +202,20 @@ def decode_16bit(data: bytes, name: str, size: tuple[int, int], what: str = "a d
     return np.asarray(image)
 
 
+def decode_gray(data: bytes, name: str) -> npt.NDArray[Any]:
+    """The values ``[H, W]`` uint8 or uint16 of an image of one channel in memory, whatever its size.
+
+    Raises FrameError that begins with `name`.
+    """
+    try:
+        image = _decode(data, cv2.IMREAD_UNCHANGED)
+    except ImageFileError as error:
+        raise FrameError(f"{name}: {error}") from error
+    if image.ndim != 2:
+        raise FrameError(f"{name}: needs one channel, but has {image.shape[2]}")
+    return image
+
+
 def decode_depth(data: bytes, name: str, depth_scale: float, size: tuple[int, int]) -> Float32Array:
     """Depth ``[H, W]`` float32 metres, NaN where invalid, of a 16-bit PNG in memory, not yet registered.
 

@@ -6,12 +6,23 @@ from dataclasses import fields
 from pathlib import Path
 
 from semdb.errors import RecordingError, UsageError
-from semdb.recordings import icl_nuim, seven_scenes, tum
+from semdb.recordings import icl_nuim, nice_slam, polycam, record3d, redwood, scannet, seven_scenes, stray_scanner, tum
 from semdb.recordings.base import Layout, Recording
 from semdb.recordings.options import ReadOptions, option_of
 from semdb.types import Camera
 
-LAYOUTS: tuple[Layout, ...] = (icl_nuim.LAYOUT, tum.LAYOUT, seven_scenes.LAYOUT)
+LAYOUTS: tuple[Layout, ...] = (
+    icl_nuim.LAYOUT,
+    tum.LAYOUT,
+    seven_scenes.LAYOUT,
+    stray_scanner.LAYOUT,
+    record3d.LAYOUT,
+    polycam.LAYOUT,
+    scannet.SENS,
+    scannet.FOLDER,
+    nice_slam.LAYOUT,
+    redwood.LAYOUT,
+)
 CHILDREN_LOOKED_AT = 200
 
 

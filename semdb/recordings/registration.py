@@ -20,7 +20,7 @@ import numpy as np
 from semdb.errors import FrameError
 from semdb.geometry import back_project, invert_pose, normalized_to_pixels, pose_from, project_to_so3
 from semdb.recordings.cameras import SEVEN_SCENES_DEPTH
-from semdb.types import Camera, Float32Array
+from semdb.types import Camera, Float32Array, FloatArray
 
 REGISTRATION_7SCENES = "7scenes"
 # The depth-to-colour calibration that ACE's set-up of 7-Scenes uses, its rotation made exact; metres.
@@ -70,9 +70,22 @@ def register_depth(depth: Float32Array, registration: str, camera: Camera) -> Fl
 
 def register_seven_scenes(depth: Float32Array, camera: Camera) -> Float32Array:
     """Depth ``[480, 640]`` metres of the depth camera (NaN invalid) as seen by the colour `camera` ``[H, W]``."""
+    return register_to(depth, SEVEN_SCENES_DEPTH, COLOR_FROM_DEPTH, camera)
+
+
+def register_to(
+    depth: Float32Array, source: Camera, color_from_depth: FloatArray, camera: Camera, max_step: float = MAX_STEP
+) -> Float32Array:
+    """Depth ``[h, w]`` metres of the camera `source` (NaN invalid) as the colour `camera` sees it, ``[H, W]``.
+
+    `color_from_depth` ``[4, 4]`` is the pose of the depth camera in the colour camera. The two may differ in
+    resolution: what lies between the centres of neighbouring depth pixels is interpolated, linear in 1/z, where they
+    are one surface, that is within `max_step` of their depth.
+    """
     from semdb.recordings.registration_kernels import invert, rasterise, transform  # numba: half a second to import
 
-    shift, rays = COLOR_FROM_DEPTH[:3, 3].astype(np.float32), _rotated_rays()
+    shift = color_from_depth[:3, 3].astype(np.float32)
+    rays = _rotated_rays(source, color_from_depth[:3, :3].tobytes())
     distorted = any(camera.distortion)
     lens = (1.0, 1.0, 0.0, 0.0) if distorted else (camera.fx, camera.fy, camera.cx, camera.cy)
     fx, fy, cx, cy = (np.float32(number) for number in lens)
@@ -86,18 +99,18 @@ def register_seven_scenes(depth: Float32Array, camera: Camera) -> Float32Array:
             pixels = normalized_to_pixels(camera, np.column_stack([u.ravel(), v.ravel()]).astype(np.float64))
             u = pixels[:, 0].reshape(part.shape).astype(np.float32)
             v = pixels[:, 1].reshape(part.shape).astype(np.float32)
-        rasterise(known, u, v, inverse_z, np.float32(MAX_STEP), nearest)
+        rasterise(known, u, v, inverse_z, np.float32(max_step), nearest)
     invert(nearest)
     return nearest
 
 
-@lru_cache(maxsize=1)
-def _rotated_rays() -> Float32Array:  # [480, 3, 640]
-    """Directions of the depth camera's pixels at z = 1, turned into the colour camera."""
-    camera = SEVEN_SCENES_DEPTH
+@lru_cache(maxsize=4)
+def _rotated_rays(camera: Camera, rotation: bytes) -> Float32Array:  # [h, 3, w]
+    """Directions of the depth camera's pixels at z = 1, turned into the colour camera by `rotation`'s float64."""
+    turn = np.frombuffer(rotation).reshape(3, 3)
     v, u = np.mgrid[: camera.height, : camera.width]
     rays = back_project(camera, np.column_stack([u.ravel(), v.ravel()]), np.ones(u.size))
-    turned = (rays @ COLOR_FROM_DEPTH[:3, :3].T).reshape(camera.height, camera.width, 3)
+    turned = (rays @ turn.T).reshape(camera.height, camera.width, 3)
     return np.ascontiguousarray(turned.transpose(0, 2, 1), dtype=np.float32)
 
 
