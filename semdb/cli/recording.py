@@ -102,6 +102,7 @@ def as_json(recording: Recording, quick: bool) -> dict[str, Any]:
         "depth_registration": recording.depth_registration,
         "trajectory_length_m": recording.trajectory_length(),
         "notes": list(recording.notes),
+        "contents": list(recording.contents),
     }
 
 
@@ -122,6 +123,7 @@ def as_lines(recording: Recording, quick: bool) -> list[str]:
         ("depth scale", f"{number(recording.depth_scale)} per metre{registered}"),
         ("masks", f"{found['with_masks']} frames" if found["with_masks"] else "none"),
         ("trajectory", f"{measure(recording.trajectory_length(), 2)} m"),
+        *(("holds", line) for line in recording.contents),
         *(("note", note) for note in recording.notes),
     ]
     return [f"{label:<12} {text}" for label, text in rows]

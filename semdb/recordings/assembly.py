@@ -31,6 +31,7 @@ class Draft:
     known_camera: Camera | None = None  # of the data set; an explicit camera wins over it
     depth_scale: float = 5000.0
     data: FrameData | None = None  # where images are no files of their own
+    contents: tuple[str, ...] = ()
 
 
 def finish(draft: Draft, camera: Camera | None) -> Recording:
@@ -85,6 +86,7 @@ def _recording(draft: Draft, usable: Sequence[FrameEntry], camera: Camera) -> Re
         depth_registration=draft.depth_registration if any(entry.depth_path for entry in usable) else "",
         categories=draft.categories,
         data=draft.data,
+        contents=draft.contents,
     )
 
 
