@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from semdb.cli.options import Overrides, settings_options
-from semdb.cli.output import print_lines
-from semdb.shown import for_terminal
 
 if TYPE_CHECKING:
     from semdb.database.records import RecordingStatus
@@ -34,8 +32,8 @@ def confirm(question: str, yes: bool) -> None:
         return
     if not sys.stdin.isatty():
         raise UsageError(f"{question} Nobody can answer here: give --yes")
-    if not typer.confirm(for_terminal(question), err=True):
-        print_lines("nothing was deleted")
+    if not typer.confirm(question, err=True):
+        print("nothing was deleted")
         raise typer.Exit(1)
 
 
@@ -73,7 +71,7 @@ def delete_recording(
         confirm(f"Delete the recording {found.map}/{found.name} with {found.keyframes} keyframes?", yes)
         with Progress(f"deleting {found.name}", "keyframes") as progress:
             deleted = store.delete_recording(found.recording_id, progress.update)
-        print_lines(f"deleted the recording {found.map}/{found.name}: {deleted.keyframes} keyframes")
+        print(f"deleted the recording {found.map}/{found.name}: {deleted.keyframes} keyframes")
 
 
 @command.command("map")
@@ -90,7 +88,7 @@ def delete_map(
         confirm(f"Delete the map {name} with {found.recordings} recordings, {found.keyframes} keyframes?", yes)
         with Progress(f"deleting {name}", "keyframes") as progress:
             deleted = store.delete_map(found.id, progress.update)
-        print_lines(f"deleted the map {name}: {deleted.recordings} recordings, {deleted.keyframes} keyframes")
+        print(f"deleted the map {name}: {deleted.recordings} recordings, {deleted.keyframes} keyframes")
 
 
 @command.command("keyframes")
@@ -110,4 +108,4 @@ def delete_keyframes(
         confirm(f"Delete {len(wanted)} keyframes?", yes)
         with Progress("deleting", "keyframes") as progress:
             number = store.delete_keyframes(wanted, progress.update)
-        print_lines(f"deleted {number} keyframes")
+        print(f"deleted {number} keyframes")

@@ -35,8 +35,7 @@ def command(overrides: Overrides, json: JsonFlag = False) -> None:
 
     Exit code 1 when something is wrong.
     """
-    from semdb.cli.output import print_json, print_lines
-    from semdb.cli.progress import say
+    from semdb.cli.output import print_json
 
     settings, checked_broker = settings_of(overrides)
     parts = (versions, database, checked_broker, folders, models)
@@ -46,10 +45,10 @@ def command(overrides: Overrides, json: JsonFlag = False) -> None:
     else:
         width = max(len(check.what) for check in checks)
         for check in checks:
-            print_lines(f"{check.state:<8} {check.what:<{width}}  {check.text}")
+            print(f"{check.state:<8} {check.what:<{width}}  {check.text}")
     problems = sum(check.state == "problem" for check in checks)
     if problems:
-        say(f"{problems} problem{'s' if problems > 1 else ''} found")
+        print(f"semdb: {problems} problem{'s' if problems > 1 else ''} found", file=sys.stderr)
         raise typer.Exit(1)
 
 

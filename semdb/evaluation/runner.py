@@ -158,7 +158,7 @@ def _evaluate_plan(
 ) -> list[EvaluationResult]:
     has_masks = all(recording.categories is not None for recording in plan.recordings)
     specs = specs_for_ingest(settings, (), has_masks=has_masks)
-    notes = [f"{recording.name}: {note}" for recording in plan.recordings for note in recording.notes]
+    notes = [f"{recording.name}: {note}" for recording in plan.recordings for note in recording.said]
     for line in dict.fromkeys((*notes, *(f"{plan.name}: {note}" for note in specs.notes))):
         if say is not None:
             say(line)

@@ -10,13 +10,14 @@ from pathlib import Path
 
 from semdb.errors import RecordingError, UsageError
 from semdb.evaluation.tasks import PaperPlan, Plan, SplitPlan
+from semdb.files import UnusableFileError, numbered_lines, read_text, without_comment
 from semdb.recordings import open_recordings
 from semdb.recordings.base import Recording
 from semdb.recordings.options import ReadOptions
 from semdb.types import Camera
 
 TRAIN_FILE, TEST_FILE = "TrainSplit.txt", "TestSplit.txt"
-_LINE = re.compile(r"(?:sequence|seq)[-_ ]?0*(\d+)", re.IGNORECASE)
+_LINE = re.compile(r"(?:sequence|seq)[-_ ]?0*(\d{1,9})", re.IGNORECASE)
 
 
 def paper_plans(path: Path, camera: Camera | None = None, reading: ReadOptions | None = None) -> list[Plan]:
@@ -50,12 +51,14 @@ def scene_plan(path: Path, camera: Camera | None = None, reading: ReadOptions | 
 def split_lines(path: Path) -> list[int]:
     """The numbers of the sequences that a split file names. Raises RecordingError with the line."""
     numbers = []
-    for row, line in enumerate(path.read_text(encoding="utf-8-sig", errors="replace").splitlines(), start=1):
-        if not line.strip():
-            continue
-        match = _LINE.fullmatch(line.strip())
+    try:
+        lines = numbered_lines(read_text(path, escape=True))
+    except UnusableFileError as error:
+        raise RecordingError(error.at(path)) from error
+    for row, line in lines:
+        match = _LINE.fullmatch(without_comment(line))
         if match is None:
-            raise RecordingError(f"{path}, line {row}: {line.strip()!r} is no sequence; a line is like 'sequence1'")
+            raise RecordingError(f"{path}, line {row}: {line[:80]!r} is no sequence; a line is like 'sequence1'")
         numbers.append(int(match.group(1)))
     if not numbers:
         raise RecordingError(f"{path}: names no sequence")

@@ -58,13 +58,13 @@ def queue_recordings(
         for recording in open_all(paths, settings, options):
             known = map_models_of(store, options.map_of(recording))
             specs = specs_for_ingest(settings, known, has_masks=recording.categories is not None)
-            for note in (*recording.notes, *specs.notes):
+            for note in (*recording.said, *specs.notes):
                 if say is not None:
                     say(f"{recording.name}: {note}")
             one = settings_of_map(settings, known).model_copy(update={"threads": 1})
             models = make_describers(specs, one)[0].models
             summary, _ = plan_ingest(recording, store, models, options, progress=progress)
-            summary.notes = (*recording.notes, *specs.notes)
+            summary.notes = (*recording.said, *specs.notes)
             requeue_failed(store.engine, summary.recording_id)
             sweep(store, send, recording_id=summary.recording_id)
             store.finish_recording(summary.recording_id)

@@ -102,14 +102,14 @@ def ingest_recordings(
         for recording in recordings:
             map_models = map_models_of(store, options.map_of(recording))
             specs = specs_for_ingest(settings, map_models, has_masks=recording.categories is not None)
-            for note in (*recording.notes, *specs.notes):
+            for note in (*recording.said, *specs.notes):
                 (say or _nobody)(f"{recording.name}: {note}")
             own = settings_of_map(settings, map_models)
             key = (specs, own.score_threshold, own.max_keypoints, own.classes, own.dynamic)
             if key not in describers:
                 describers[key] = make_describers(specs, own)
             summary = ingest_recording(recording, store, describers[key], options, progress=progress)
-            summary.notes = (*recording.notes, *specs.notes)
+            summary.notes = (*recording.said, *specs.notes)
             summaries.append(summary)
     return summaries
 

@@ -7,17 +7,17 @@ from collections import OrderedDict
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
-import cv2
 import numpy as np
 
 from semdb.database.records import StoredKeyframe
 from semdb.database.refinements import POINTS
 from semdb.database.store import Store
-from semdb.errors import CodecError, NotFoundError
+from semdb.errors import CodecError, FrameError, NotFoundError
 from semdb.geometry import POSE_UNIT_M, pose_distances
 from semdb.geometry.sensor import depth_noise
 from semdb.localization.coarse import MapChange
 from semdb.localization.views import ClassNumbers, KeyframeView, make_keyframe_view
+from semdb.recordings.images import decode_color_grey
 from semdb.types import Float32Array, FloatArray, ImageArray, Keypoints
 
 USED, STALE, NONE, OFF = "used", "stale", "none", "off"  # what becomes of its points
@@ -108,13 +108,10 @@ class KeyframeCache:
     def _grey(self, stored: StoredKeyframe) -> ImageArray | None:
         """The keyframe's image in grey; None where it cannot be decoded or is not what the camera took."""
         try:
-            encoded = np.frombuffer(self._store.load_image(stored.id).rgb, np.uint8)
-        except NotFoundError:
-            return None  # deleted a moment ago
-        grey = cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE) if len(encoded) else None
-        if grey is None or grey.shape != (stored.camera.height, stored.camera.width) or grey.dtype != np.uint8:
+            grey = decode_color_grey(self._store.load_image(stored.id).rgb, f"keyframe {stored.id}")
+        except (NotFoundError, FrameError):  # deleted a moment ago, or damaged
             return None
-        return np.asarray(grey, np.uint8)
+        return grey if grey.shape == (stored.camera.height, stored.camera.width) else None
 
     def name_of(self, keyframe_id: int) -> tuple[str, int]:
         """Recording and frame index of a keyframe that was loaded."""

@@ -7,12 +7,17 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from semdb.errors import FrameError, RecordingError
+from semdb.errors import FrameError, RecordingError, UsageError
 from semdb.recordings.base import DroppedFrame, FrameData, FrameEntry, Recording
+from semdb.recordings.camera_files import CAMERA_FILE, find_camera_file
 from semdb.recordings.cameras import with_size
 from semdb.recordings.images import ImageHeader, inspect_file
+from semdb.recordings.intrinsics import camera_doubts, camera_problem
+from semdb.recordings.options import ReadOptions
 from semdb.recordings.registration import depth_size
 from semdb.types import Camera
+
+HIGHEST_INDEX = 2**31 - 1  # that the database takes
 
 
 @dataclass(slots=True)
@@ -30,8 +35,36 @@ class Draft:
     categories: Mapping[int, str] | None = None
     known_camera: Camera | None = None  # of the data set; an explicit camera wins over it
     depth_scale: float = 5000.0
+    assumed_scale: str = ""  # why that scale, where nothing says it; "" where something does
+    assumed: list[str] = field(default_factory=list)  # what is taken for granted, for people
     data: FrameData | None = None  # where images are no files of their own
-    contents: tuple[str, ...] = ()
+
+
+def use_camera_file(draft: Draft, camera: Camera | None, options: ReadOptions, *folders: Path) -> bool:
+    """Takes camera and depth scale from the file beside the frames, in one of `folders`; False where there is none.
+
+    `camera` and `options` are what the user gave, which wins. Raises RecordingError for a file that cannot be read,
+    unless it is another than ``camera.json`` and there is a `camera`.
+    """
+    found, there = None, False
+    try:
+        found = find_camera_file(*folders)
+        there = found is not None
+    except RecordingError as error:
+        if camera is None or any((folder / CAMERA_FILE).exists() for folder in folders):
+            raise
+        draft.notes.append(f"{error}; --camera is taken")
+        there = True
+    if found is not None:
+        draft.known_camera = found.camera
+        draft.assumed_scale = f"{found.path.name} does not say it"
+        if found.depth_scale is not None:
+            draft.depth_scale, draft.assumed_scale = found.depth_scale, ""
+        if found.path.name != CAMERA_FILE and camera is None:
+            draft.assumed.append(f"camera: {found.path.name}, as that of colour, depth and poses alike")
+    if options.depth_scale is not None:
+        draft.depth_scale, draft.assumed_scale = options.depth_scale, ""
+    return there
 
 
 def finish(draft: Draft, camera: Camera | None) -> Recording:
@@ -41,6 +74,10 @@ def finish(draft: Draft, camera: Camera | None) -> Recording:
     are not looked at: `known_camera` or `camera` must have their size.
     Raises RecordingError when no frame is left, or the images do not have the size of the camera.
     """
+    for entry in draft.entries:
+        if entry.index > HIGHEST_INDEX:
+            draft.dropped.append(DroppedFrame(entry.name, f"its number is too large: at most {HIGHEST_INDEX}"))
+    draft.entries = [entry for entry in draft.entries if entry.index <= HIGHEST_INDEX]
     if draft.data is not None:
         return _finish_data(draft, camera)
     headers, unreadable = _inspect_images(draft.entries)
@@ -48,6 +85,7 @@ def finish(draft: Draft, camera: Camera | None) -> Recording:
     if not headers:
         raise no_usable_frame(draft)
     chosen = _choose_camera(draft, camera, [header for _, header in headers])
+    _check_cameras(draft, [entry for entry, _ in headers], chosen, camera)
     usable = []
     for found, header in headers:
         entry = found if camera is None else replace(found, camera=None)
@@ -67,12 +105,17 @@ def _finish_data(draft: Draft, camera: Camera | None) -> Recording:
         draft.entries = [replace(entry, camera=None) for entry in draft.entries]
     if chosen is None or not (chosen.width and chosen.height):
         raise unknown_camera(draft.path)
+    _check_cameras(draft, draft.entries, chosen, camera)
     return _recording(draft, draft.entries, chosen)
 
 
 def _recording(draft: Draft, usable: Sequence[FrameEntry], camera: Camera) -> Recording:
     if not usable:
         raise no_usable_frame(draft)
+    if draft.assumed_scale and any(entry.depth_path for entry in usable):
+        draft.assumed.append(
+            f"depth scale: {draft.depth_scale:g} per metre ({draft.assumed_scale}); --depth-scale gives another"
+        )
     return Recording(
         path=draft.path,
         name=draft.name,
@@ -83,10 +126,10 @@ def _recording(draft: Draft, usable: Sequence[FrameEntry], camera: Camera) -> Re
         entries=tuple(sorted(usable, key=lambda entry: entry.index)),
         dropped=tuple(draft.dropped),
         notes=tuple(draft.notes),
+        assumed=tuple(draft.assumed),
         depth_registration=draft.depth_registration if any(entry.depth_path for entry in usable) else "",
         categories=draft.categories,
         data=draft.data,
-        contents=draft.contents,
     )
 
 
@@ -132,6 +175,20 @@ def _choose_camera(draft: Draft, camera: Camera | None, headers: Sequence[ImageH
         f"{draft.path}: {count} of {len(headers)} images have {size[0]}x{size[1]} pixels, none the "
         f"{chosen.width}x{chosen.height} of {origin}; give the intrinsics of these images with --camera fx,fy,cx,cy"
     )
+
+
+def _check_cameras(draft: Draft, entries: Sequence[FrameEntry], chosen: Camera, given: Camera | None) -> None:
+    """Refuses intrinsics that nothing has, and says what is to be doubted. Raises UsageError, RecordingError."""
+    if given is not None:
+        if problem := camera_problem(chosen):
+            raise UsageError(f"--camera: {problem}")
+    else:
+        for camera in {chosen, *(entry.camera for entry in entries if entry.camera is not None)}:
+            if problem := camera_problem(camera):
+                raise RecordingError(
+                    f"{draft.path}: the camera of this recording is impossible: {problem}; --camera gives another"
+                )
+    draft.assumed += [f"camera: {doubt}" for doubt in camera_doubts(chosen)]
 
 
 def _usual_camera(entries: Sequence[FrameEntry]) -> Camera | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -11,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semdb.errors import RecordingError
+from semdb.files import UnusableFileError, fields_of, numbered_lines, parse_number, read_text, without_comment
 from semdb.geometry import (
     pose_from,
     quat_wxyz_from_rotation,
@@ -24,7 +26,12 @@ from semdb.types import FloatArray
 
 MAX_TIME_DIFFERENCE_NS = 20_000_000
 TURN_WINDOW_NS = 50_000_000
+ASSOCIATIONS = "associations.txt"
+LONGEST_TIME = 100  # characters
 NORM_TOLERANCE = 0.05  # data sets round quaternions to four digits; more than this is no rotation
+
+_TIME_AND_NAME = re.compile(r"([^\s,;]+(?:,\d+)?)(?:\s*[,;]\s*|\s+)(\S.*)")
+_UNUSUAL = re.compile(r"""["'\\#%]|\s//""")
 
 Int64Array = npt.NDArray[np.int64]
 
@@ -56,21 +63,17 @@ class Trajectory:
 
 
 def read_lines(path: Path) -> list[tuple[int, str]]:
-    """Numbered (from 1) lines that are neither empty nor a comment (#). Raises RecordingError."""
+    """Numbered (from 1) lines that are neither empty nor a comment; see `semdb.files`. Raises RecordingError."""
     try:
-        text = path.read_text(encoding="utf-8-sig", errors="replace")
-    except FileNotFoundError as error:
-        raise RecordingError(f"{path}: the file is missing") from error
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
-    lines = ((number, line.strip()) for number, line in enumerate(text.splitlines(), start=1))
-    return [(number, line) for number, line in lines if line and not line.startswith("#")]
+        return numbered_lines(read_text(path, escape=True))
+    except UnusableFileError as error:
+        raise RecordingError(error.at(path)) from error
 
 
 def parse_time_ns(text: str) -> int:
     """Nanoseconds of a decimal number of seconds, exactly. Raises ValueError with the reason."""
     try:
-        seconds = Decimal(text)
+        seconds = Decimal(text if len(text) <= LONGEST_TIME and "_" not in text else "")
     except InvalidOperation as error:
         raise ValueError(f"{text[:40]!r} is no time in seconds") from error
     if not seconds.is_finite() or abs(seconds) > Decimal("9.2e9"):
@@ -82,17 +85,71 @@ def read_file_list(path: Path) -> tuple[list[TimedFile], list[BadLine]]:
     """Lines of ``time filename`` in the order of the file, and those that cannot be used. Raises RecordingError."""
     files, bad = [], []
     for number, line in read_lines(path):
-        parts = line.split(maxsplit=1)
+        found = _TIME_AND_NAME.fullmatch(line)
         try:
-            if len(parts) != 2:
+            if found is None:
                 raise ValueError("needs a time and a file name")
-            files.append(TimedFile(parse_time_ns(parts[0]), parts[1], number))
+            time = found[1].replace(",", ".") if "." not in found[1] else found[1]
+            files.append(TimedFile(parse_time_ns(time), existing_name(path.parent, found[2]), number))
         except ValueError as error:
             bad.append(BadLine(number, str(error)))
     if not files:
         where = f", line {bad[0].line}: {bad[0].reason}" if bad else ": lists no image"
         raise RecordingError(f"{path}{where}; lines of 'time filename' are needed")
     return files, bad
+
+
+def has_times(path: Path) -> bool:
+    """Whether an ``associations.txt`` has times, as TUM's associate.py writes them, not ICL-NUIM's frame numbers."""
+    try:
+        lines = read_lines(path)
+    except RecordingError:
+        return False
+    return any("." in line.split()[0] for _, line in lines[:10])
+
+
+def read_associations(path: Path) -> tuple[list[TimedFile], list[TimedFile], list[BadLine]]:
+    """Colour and depth images of lines ``time rgb/NAME time depth/NAME`` (or depth first), and unusable lines.
+
+    Raises RecordingError.
+    """
+    colour, depth, bad = [], [], []
+    for number, line in read_lines(path):
+        parts = without_comment(line).split()
+        try:
+            if len(parts) != 4:
+                raise ValueError("needs 'time rgb/NAME time depth/NAME'")
+            pair = [
+                TimedFile(parse_time_ns(parts[k]), existing_name(path.parent, parts[k + 1]), number) for k in (0, 2)
+            ]
+        except ValueError as error:
+            bad.append(BadLine(number, str(error)))
+            continue
+        if "depth" in pair[0].name and "depth" not in pair[1].name:
+            pair.reverse()
+        colour.append(pair[0])
+        depth.append(pair[1])
+    if not colour:
+        where = f", line {bad[0].line}: {bad[0].reason}" if bad else ": lists no image"
+        raise RecordingError(f"{path}{where}")
+    return colour, depth, bad
+
+
+def existing_name(folder: Path, text: str) -> str:
+    """The name of a file as a line of a list gives it: without quotes around it, without a comment after it, and with
+    slashes for the backslashes of Windows, unless a file has the very name.
+    """
+    if not _UNUSUAL.search(text) or _is_there(folder, text):
+        return text
+    name = without_comment(text).strip("\"'")
+    return name if _is_there(folder, name) else name.replace("\\", "/")
+
+
+def _is_there(folder: Path, name: str) -> bool:
+    try:
+        return (folder / name).exists()
+    except (OSError, ValueError):  # too long, or with a NUL
+        return False
 
 
 def parse_pose(values: Sequence[str], quaternion: str | None = None) -> tuple[FloatArray, FloatArray]:
@@ -102,15 +159,11 @@ def parse_pose(values: Sequence[str], quaternion: str | None = None) -> tuple[Fl
     """
     if len(values) != 7:
         raise ValueError(f"needs tx ty tz qx qy qz qw, but has {len(values)} numbers")
-    try:
-        numbers = np.array([float(value) for value in values])
-    except ValueError as error:
-        raise ValueError("has something that is no number") from error
-    if not np.isfinite(numbers).all():
-        raise ValueError("has a number that is not finite")
+    numbers = np.array([parse_number(value) for value in values])
     quat_wxyz = numbers[3:] if quaternion == "wxyz" else numbers[[6, 3, 4, 5]]
-    norm = float(np.linalg.norm(quat_wxyz))
-    if abs(norm - 1) > NORM_TOLERANCE:
+    with np.errstate(over="ignore"):
+        norm = float(np.linalg.norm(quat_wxyz))
+    if not abs(norm - 1) <= NORM_TOLERANCE:
         raise ValueError(f"is no rotation: the quaternion has length {norm:.3g} instead of 1")
     return quat_wxyz / norm, numbers[:3]
 
@@ -125,8 +178,10 @@ def read_trajectory(path: Path, options: ReadOptions | None = None) -> tuple[Tra
     options = options or ReadOptions()
     samples: list[tuple[int, FloatArray, FloatArray]] = []
     bad: list[BadLine] = []
+    commas = False
     for number, line in read_lines(path):
-        values = line.split()
+        values, has_commas = fields_of(line)
+        commas |= has_commas
         try:
             samples.append((parse_time_ns(values[0]), *parse_pose(values[1:], options.quaternion)))
         except ValueError as error:
@@ -135,6 +190,8 @@ def read_trajectory(path: Path, options: ReadOptions | None = None) -> tuple[Tra
         where = f", line {bad[0].line}: {bad[0].reason}" if bad else ": has no pose"
         raise RecordingError(f"{path}{where}; lines of 'time tx ty tz qx qy qz qw' are needed")
     notes = [bad_lines_note(path.name, bad, "poses")] if bad else []
+    if commas:
+        notes.append(decimal_commas_note(path.name))
     times = np.array([sample[0] for sample in samples], dtype=np.int64)
     if (np.diff(times) < 0).any():
         notes.append(f"{path.name}: times are not in ascending order; sorted")
@@ -158,6 +215,11 @@ def corrected(trajectory: Trajectory, options: ReadOptions) -> Trajectory:
     poses = [options.pose(pose_from(*sample)) for sample in zip(rotations, trajectory.translation, strict=True)]
     quats = np.stack([quat_wxyz_from_rotation(pose[:3, :3]) for pose in poses])
     return Trajectory(times, quats, np.stack([pose[:3, 3] for pose in poses]))
+
+
+def decimal_commas_note(file_name: str) -> str:
+    """One sentence for people about numbers that were read in another notation than is usual."""
+    return f"{file_name}: numbers with decimal commas (1,5) are read as such"
 
 
 def bad_lines_note(file_name: str, bad: Sequence[BadLine], what: str) -> str:

@@ -90,7 +90,8 @@ class Recording:
     """A recording that was recognised: its usable frames in ascending index, and what was dropped.
 
     `depth_scale` is units per metre of the depth files, `depth_registration` what `read` does to them ("" nothing),
-    `categories` the class of each mask label where the recording has masks. `notes` are for people.
+    `categories` the class of each mask label where the recording has masks. `notes` are for people, and so is what
+    of camera, depth and poses is `assumed` because no file says it; `said` is both.
     `decode_failures` collects frames that looked right when the recording was opened but cannot be decoded.
     """
 
@@ -103,12 +104,18 @@ class Recording:
     entries: tuple[FrameEntry, ...]
     dropped: tuple[DroppedFrame, ...]
     notes: tuple[str, ...] = ()
+    assumed: tuple[str, ...] = ()
     depth_registration: str = ""
     categories: Mapping[int, str] | None = None
     source: str = ""  # what the database keeps of where it came from; "": the folder
     data: FrameData | None = None  # where images are no files of their own
-    contents: tuple[str, ...] = ()  # what else the file holds and what is taken of it, a line each for people
     decode_failures: list[DroppedFrame] = field(default_factory=list)
+    _failed: set[str] = field(default_factory=set)  # names of those
+
+    @property
+    def said(self) -> tuple[str, ...]:
+        """All that people should know about how the recording was read."""
+        return tuple(dict.fromkeys((*self.notes, *self.assumed)))
 
     def camera_of(self, entry: FrameEntry) -> Camera:
         """The camera of a frame: its own where frames differ in it."""
@@ -176,7 +183,8 @@ class Recording:
 
     def note_decode_failure(self, entry: FrameEntry, error: FrameError) -> None:
         """Remembers that `entry` cannot be decoded, once."""
-        if all(failure.name != entry.name for failure in self.decode_failures):
+        if entry.name not in self._failed:
+            self._failed.add(entry.name)
             self.decode_failures.append(DroppedFrame(entry.name, str(error)))
 
     def trajectory_length(self) -> float:

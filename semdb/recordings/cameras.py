@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
-from pathlib import Path
 
-from semdb.errors import RecordingError, UsageError
+from semdb.errors import UsageError
+from semdb.recordings.camera_files import CAMERA_FILE
 from semdb.types import Camera
-
-CAMERA_FILE = "camera.json"
 
 # https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats: calibrations of the three Kinects; k1, k2, p1, p2, k3.
 TUM_CAMERAS = {
@@ -68,47 +65,3 @@ def with_size(camera: Camera, size: tuple[int, int]) -> Camera:
     if camera.width and camera.height:
         return camera
     return Camera(size[0], size[1], camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion)
-
-
-def read_camera_file(path: Path) -> tuple[Camera, float]:
-    """Camera and depth scale (units per metre, 5000 when not given) of a ``camera.json``.
-
-    Raises RecordingError that names the file and the key.
-    """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise RecordingError(f"{path}: is not a text file") from error
-    except json.JSONDecodeError as error:
-        raise RecordingError(f"{path}, line {error.lineno}: is not JSON: {error.msg}") from error
-    if not isinstance(content, dict):
-        raise RecordingError(f"{path}: must be a JSON object with width, height, fx, fy, cx, cy")
-
-    def number(key: str, value: object, positive: bool = False) -> float:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise RecordingError(f"{path}: {key!r} must be a finite number, but is {value!r}")
-        if positive and value <= 0:
-            raise RecordingError(f"{path}: {key!r} must be positive, but is {value!r}")
-        return float(value)
-
-    missing = [key for key in ("width", "height", "fx", "fy", "cx", "cy") if key not in content]
-    if missing:
-        raise RecordingError(f"{path}: {', '.join(missing)} missing")
-    width, height = (number(key, content[key], positive=True) for key in ("width", "height"))
-    if width != int(width) or height != int(height):
-        raise RecordingError(f"{path}: 'width' and 'height' must be whole numbers")
-    distortion = content.get("distortion", [])
-    if not isinstance(distortion, list) or len(distortion) not in (0, 4, 5):
-        raise RecordingError(f"{path}: 'distortion' must be a list of k1, k2, p1, p2 and perhaps k3")
-    camera = Camera(
-        int(width),
-        int(height),
-        number("fx", content["fx"], positive=True),
-        number("fy", content["fy"], positive=True),
-        number("cx", content["cx"]),
-        number("cy", content["cy"]),
-        tuple(number("distortion", value) for value in distortion),
-    )
-    return camera, number("depth_scale", content.get("depth_scale", TUM_DEPTH_SCALE), positive=True)

@@ -15,24 +15,36 @@ from pathlib import Path
 import numpy as np
 
 from semdb.errors import RecordingError
+from semdb.files import fields_of, without_comment
 from semdb.geometry import pose_from, rotation_from_quat_wxyz
-from semdb.recordings.assembly import Draft, finish
-from semdb.recordings.association import BadLine, bad_lines_note, parse_pose, read_lines
+from semdb.recordings.assembly import Draft, finish, use_camera_file
+from semdb.recordings.association import (
+    ASSOCIATIONS,
+    BadLine,
+    bad_lines_note,
+    decimal_commas_note,
+    has_times,
+    parse_pose,
+    read_lines,
+)
 from semdb.recordings.base import DroppedFrame, FrameEntry, Layout, Recording
 from semdb.recordings.cameras import ICL_NUIM, TUM_DEPTH_SCALE
 from semdb.recordings.options import ReadOptions
 from semdb.types import Camera, FloatArray
 
-ASSOCIATIONS = "associations.txt"
 POSES = "*.gt.freiburg"
+NUMBER = re.compile(r"[0-9]{1,9}")
+FRAME = re.compile(r"[0-9]{1,9}(\.0*)?")
 FLIP_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
 def is_icl_nuim(path: Path) -> bool:
     """Whether a folder has ICL-NUIM's poses, or its associations without TUM's lists."""
-    return path.is_dir() and (
-        any(path.glob(POSES)) or ((path / ASSOCIATIONS).is_file() and not (path / "rgb.txt").is_file())
-    )
+    if not path.is_dir():
+        return False
+    if any(path.glob(POSES)):
+        return True
+    return (path / ASSOCIATIONS).exists() and not (path / "rgb.txt").exists() and not has_times(path / ASSOCIATIONS)
 
 
 def open_icl_nuim(path: Path, camera: Camera | None = None, options: ReadOptions | None = None) -> Recording:
@@ -52,11 +64,16 @@ def open_icl_nuim(path: Path, camera: Camera | None = None, options: ReadOptions
         entries=[],
         dropped=dropped,
         known_camera=ICL_NUIM,
-        depth_scale=options.depth_scale or TUM_DEPTH_SCALE,
+        depth_scale=TUM_DEPTH_SCALE,
+        assumed_scale="that of ICL-NUIM",
     )
+    if not use_camera_file(draft, camera, options, path) and camera is None:
+        draft.assumed.append("camera: that of ICL-NUIM, 481.2,480,319.5,239.5")
     if [row[0] for row in rows] != sorted(row[0] for row in rows):
         draft.notes.append(f"{ASSOCIATIONS}: frame numbers are not in ascending order; sorted")
     poses = _read_poses(path, draft.notes, options)
+    if poses is not None:
+        draft.assumed.append(f"poses: {POSES} is left-handed with y up, as ICL-NUIM's, and is mirrored")
     used: dict[int, str] = {}
     for index, (number, depth_name, colour_name) in enumerate(sorted(rows, key=lambda row: row[0])):
         if number in used:
@@ -81,8 +98,8 @@ def _read_associations(path: Path) -> tuple[list[tuple[int, str, str]], list[Dro
     rows: list[tuple[int, str, str]] = []
     bad: list[BadLine] = []
     for line_number, line in read_lines(path / ASSOCIATIONS):
-        parts = line.split()
-        if len(parts) == 4 and parts[0].isdecimal() and parts[2].isdecimal():
+        parts = without_comment(line).replace(",", " ").split()
+        if len(parts) == 4 and NUMBER.fullmatch(parts[0]) and NUMBER.fullmatch(parts[2]):
             # the colour image decides the number; the order of the two columns differs between copies
             colour_first = "rgb" in parts[1] and "depth" in parts[3]
             colour, depth = (1, 3) if colour_first else (3, 1)
@@ -96,7 +113,7 @@ def _read_associations(path: Path) -> tuple[list[tuple[int, str, str]], list[Dro
 
 
 def _list_images(path: Path) -> tuple[list[tuple[int, str, str]], list[DroppedFrame]]:
-    colour = sorted((int(file.stem), file.name) for file in (path / "rgb").glob("*.png") if file.stem.isdecimal())
+    colour = sorted((int(file.stem), file.name) for file in (path / "rgb").glob("*.png") if NUMBER.fullmatch(file.stem))
     if not colour:
         raise RecordingError(f"{path}: neither {ASSOCIATIONS} nor images rgb/N.png; ICL-NUIM's PNG layout has both")
     return [(number, f"depth/{name}", f"rgb/{name}") for number, name in colour], []
@@ -112,11 +129,12 @@ def _read_poses(path: Path, notes: list[str], options: ReadOptions) -> dict[int,
         raise RecordingError(f"{path}: several ground truths ({names}); keep the one of this recording")
     poses: dict[int, FloatArray] = {}
     bad: list[BadLine] = []
-    repeated = 0
+    repeated, commas = 0, False
     for line_number, line in read_lines(files[0]):
-        values = line.split()
+        values, has_commas = fields_of(line)
+        commas |= has_commas
         try:
-            if not re.fullmatch(r"\d+(\.0*)?", values[0]):
+            if not FRAME.fullmatch(values[0]):
                 raise ValueError(f"{values[0][:40]!r} is no frame number")
             quat_wxyz, translation = parse_pose(values[1:], options.quaternion)
         except ValueError as error:
@@ -131,6 +149,8 @@ def _read_poses(path: Path, notes: list[str], options: ReadOptions) -> dict[int,
         raise RecordingError(f"{files[0]}{where}; lines of 'N tx ty tz qx qy qz qw' are needed")
     if bad:
         notes.append(bad_lines_note(files[0].name, bad, "poses"))
+    if commas:
+        notes.append(decimal_commas_note(files[0].name))
     if repeated:
         notes.append(f"{files[0].name}: {repeated} repeated frame number(s); the first pose of each is kept")
     return poses

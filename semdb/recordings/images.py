@@ -1,7 +1,7 @@
 """Image files: cheap checks of headers and ends, and decoding that never returns half an image.
 
-OpenCV decodes a truncated PNG or JPEG in part and says nothing, so the structure of the file is checked first:
-PNG chunks with their checksums up to IEND, JPEG markers up to EOI.
+This is the one reader of pictures: of recordings, queries, training data and the database. OpenCV decodes a truncated
+PNG or JPEG in part and says nothing, so the structure of the file is checked first, and its size before that.
 """
 
 # compiled functions take what numba infers
@@ -9,9 +9,7 @@ PNG chunks with their checksums up to IEND, JPEG markers up to EOI.
 from __future__ import annotations
 
 import os
-import re
 import struct
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -19,65 +17,74 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from semdb import files
 from semdb.errors import FrameError
+from semdb.files import UnusableFileError
 from semdb.recordings import png
+from semdb.recordings.headers import MOST_PIXELS, ImageHeader, NotAnImageError, checked, read_header
+from semdb.recordings.jpeg import JPEG_END, JPEG_START, check_jpeg, orientation_of, read_jpeg_header
 from semdb.recordings.png import TRUNCATED, ImageFileError
 from semdb.types import Float32Array, ImageArray
 
-JPEG_START = b"\xff\xd8\xff"
-JPEG_END = b"\xff\xd9"
-JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-# In entropy-coded data a marker is 0xFF followed by anything but a stuffed zero, a restart or another fill byte.
-JPEG_MARKER_IN_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
+MOST_IMAGE_BYTES = 1 << 29
+MOST_REDUCED_PIXELS = 1 << 28
+"""Of a JPEG that is decoded at a half or less: 268 million."""
+START = 1 << 16
 TAIL = 4096
-NOT_AN_IMAGE = "is not a PNG or JPEG image"
+DARK = 16  # of 255: nearly black is what has 99 of 100 pixels below
+FLAT = 1.5  # of 255: nearly empty is what has a standard deviation below; noise and shading alone give more
+LEAST_DEPTH = 0.01  # share of pixels with depth
 
-
-@dataclass(frozen=True, slots=True)
-class ImageHeader:
-    """What the header of an image file says; `channels` counts a palette image as 3."""
-
-    kind: str  # "png" or "jpeg"
-    width: int
-    height: int
-    bits: int
-    channels: int
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height in pixels."""
-        return self.width, self.height
+__all__ = [
+    "ImageHeader",
+    "decode_16bit",
+    "decode_color",
+    "decode_color_grey",
+    "decode_depth",
+    "inspect_file",
+    "orientation_of",
+    "read_bytes",
+    "read_depth_image",
+    "read_query_image",
+    "remark_on_color",
+    "remark_on_depth",
+]
 
 
 def inspect_file(path: Path) -> ImageHeader:
-    """Header of a PNG or JPEG file, and a cheap check that its end is there; nothing is decoded.
+    """Header of an image file, and a cheap check that its end is there; nothing is decoded.
 
     Raises FrameError whose message is the reason alone, without the name of the file.
     """
     try:
-        with path.open("rb") as file:
-            start = file.read(png.HEADER_BYTES)
-            if not start:
-                raise ImageFileError("the file is empty")
-            if start.startswith(png.SIGNATURE):
-                header = _header_of(png.read_header(start))
-                _check_png_end(file)
-            elif start.startswith(JPEG_START):
-                header = _jpeg_header(file)
-                _check_jpeg_end(file)
-            else:
-                raise ImageFileError(NOT_AN_IMAGE)
-    except FileNotFoundError as error:
-        raise FrameError("the file is missing") from error
+        with files.open_regular(path, MOST_IMAGE_BYTES) as file:
+            return checked(_inspect(file))
     except OSError as error:
         raise FrameError(f"the file cannot be read: {error.strerror}") from error
-    except ImageFileError as error:
+    except (UnusableFileError, ImageFileError) as error:
         raise FrameError(str(error)) from error
-    return header
 
 
-def _header_of(header: png.PngHeader) -> ImageHeader:
-    return ImageHeader("png", header.width, header.height, header.bits, header.channels)
+def _inspect(file: BinaryIO) -> ImageHeader:
+    start = file.read(png.HEADER_BYTES)
+    if start.startswith(png.SIGNATURE):
+        header = read_header(start)
+        _check_png_end(file)
+        return header
+    start += file.read(START)
+    if not start.startswith(JPEG_START):
+        return read_header(start + file.read())
+    try:
+        jpeg = read_jpeg_header(start)
+    except ImageFileError:  # pictures and profiles may come before the header
+        start += file.read()
+        jpeg = read_jpeg_header(start)
+    size = file.seek(0, os.SEEK_END)
+    file.seek(max(0, size - TAIL))
+    if JPEG_END not in file.read():  # a film may follow: look where the image ends
+        file.seek(0)
+        check_jpeg(file.read())
+    return ImageHeader("jpeg", *jpeg)
 
 
 def _check_png_end(file: BinaryIO) -> None:
@@ -95,90 +102,90 @@ def _check_png_end(file: BinaryIO) -> None:
     raise ImageFileError(TRUNCATED)
 
 
-def _jpeg_header(file: BinaryIO) -> ImageHeader:
-    file.seek(2)
-    while True:
-        marker = file.read(2)
-        while len(marker) == 2 and marker == b"\xff\xff":
-            marker = marker[1:] + file.read(1)
-        if len(marker) < 2:
-            raise ImageFileError(TRUNCATED)
-        if marker[0] != 0xFF or marker[1] == 0xDA:
-            raise ImageFileError("has a broken JPEG header")
-        body = file.read(2)
-        if len(body) < 2:
-            raise ImageFileError(TRUNCATED)
-        length = int.from_bytes(body, "big")
-        if marker[1] in JPEG_FRAMES:
-            frame = file.read(6)
-            if len(frame) < 6:
-                raise ImageFileError(TRUNCATED)
-            bits, height, width, channels = struct.unpack(">BHHB", frame)
-            return ImageHeader("jpeg", width, height, bits, channels)
-        file.seek(length - 2, os.SEEK_CUR)
-
-
-def _check_jpeg_end(file: BinaryIO) -> None:
-    size = file.seek(0, os.SEEK_END)
-    file.seek(max(0, size - TAIL))
-    if JPEG_END not in file.read():
-        raise ImageFileError(TRUNCATED)
-
-
-def _check_jpeg_bytes(data: bytes) -> None:
-    """Walks the markers up to EOI, over entropy-coded data as well."""
-    position, scans = 2, 0
-    while position + 2 <= len(data):
-        if data[position] != 0xFF:
-            raise ImageFileError(f"is damaged: no JPEG marker at byte {position}")
-        marker = data[position + 1]
-        if marker == 0xFF:
-            position += 1
-        elif marker == 0xD9:
-            if scans == 0:
-                raise ImageFileError("is damaged: a JPEG without image data")
-            return
-        else:
-            position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
-            if marker == 0xDA:
-                scans += 1
-                found = JPEG_MARKER_IN_SCAN.search(data, position)
-                position = found.start() if found else len(data)
-    raise ImageFileError(TRUNCATED)
-
-
-def _decode(data: bytes, flags: int) -> npt.NDArray[Any]:
+def _decode(data: bytes, flags: int, most_pixels: int = MOST_PIXELS) -> npt.NDArray[Any]:
     """Pixels as OpenCV gives them with `flags`, but three channels of 8 bits are always RGB. Raises ImageFileError."""
-    if not data:
-        raise ImageFileError("the file is empty")
-    if data.startswith(png.SIGNATURE):
+    try:
+        header = read_header(data, most_pixels)
+    except NotAnImageError as error:
+        raise ImageFileError("is not an image that can be decoded (PNG and JPEG can)") from error
+    if header.kind == "png":
         # all chunks are checked first: libpng would print, and give back what it has
         pixels = png.decode(png.read_header(data[: png.HEADER_BYTES]), list(png.chunks(data)))
         if pixels is not None and (pixels.ndim == 3 or flags == cv2.IMREAD_UNCHANGED):
             return pixels
-    elif data.startswith(JPEG_START):
-        _check_jpeg_bytes(data)
+    elif header.kind == "jpeg":
+        check_jpeg(data)
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # it would print what is in the error
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
         raise ImageFileError(f"cannot be decoded: {error.err}") from error
+    finally:
+        cv2.utils.logging.setLogLevel(level)
     if image is None:
         raise ImageFileError("is not an image that can be decoded (PNG and JPEG can)")
     return np.asarray(image)
 
 
-def decode_color(data: bytes, name: str) -> ImageArray:
+def decode_color(data: bytes, name: str, reduce: int = 1) -> ImageArray:
     """RGB ``[H, W, 3]`` uint8 of a PNG, JPEG (or what else OpenCV decodes) in memory.
 
-    Grey images get three equal channels, transparency is dropped, 16-bit images are scaled to 8 bits. An
-    orientation mark of a telephone is not applied: intrinsics belong to the pixels as stored.
-    `name` is for messages. Raises FrameError for what is no image, truncated or damaged.
+    Grey images get three equal channels, transparency is dropped, 16-bit images are scaled to 8 bits: from the 10, 12
+    or 14 that they use where their values go no further. An orientation mark of a telephone is not applied: intrinsics
+    belong to the pixels as stored. `reduce` of 2, 4 or 8 makes a JPEG smaller while it is decoded, which takes less
+    memory: ``ceil(W / reduce)`` pixels, each the mean of those that it covers; other kinds are decoded as they are.
+    `name` is for messages. Raises FrameError for what is no image, truncated, damaged or too large.
     """
     try:
-        rgb = _decode(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
+        return _decode_color(data, reduce)
     except ImageFileError as error:
         raise FrameError(f"{name}: {error}") from error
-    return np.asarray(rgb, dtype=np.uint8)
+
+
+_REDUCED = {2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4, 8: cv2.IMREAD_REDUCED_COLOR_8}
+
+
+def _decode_color(data: bytes, reduce: int) -> ImageArray:
+    if reduce > 1 and data.startswith(JPEG_START):
+        bgr = _decode(data, _REDUCED[reduce] | cv2.IMREAD_IGNORE_ORIENTATION, MOST_REDUCED_PIXELS)
+        return np.ascontiguousarray(bgr[..., ::-1])
+    if _is_deep(data):
+        deep = _decode(data, cv2.IMREAD_UNCHANGED)
+        if deep.dtype == np.uint16:
+            return _eight_bits(deep)
+    return np.asarray(_decode(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION), dtype=np.uint8)
+
+
+def _is_deep(data: bytes) -> bool:
+    try:
+        return read_header(data).bits == 16
+    except NotAnImageError:
+        return False
+
+
+def bits_used(pixels: npt.NDArray[np.uint16]) -> int:
+    """16, or the 10, 12 or 14 bits that a camera with so many writes into the lower bits of 16."""
+    highest = int(pixels.max(initial=0))
+    return next((bits for bits in (10, 12, 14) if highest < 1 << bits), 16) if highest > 255 else 16
+
+
+def _eight_bits(pixels: npt.NDArray[np.uint16]) -> ImageArray:
+    """RGB uint8 of grey, BGR or BGRA uint16."""
+    colours = pixels[..., :3] if pixels.ndim == 3 else pixels[..., None]
+    small = (colours >> (bits_used(colours) - 8)).astype(np.uint8)
+    if small.shape[2] == 3:
+        return np.ascontiguousarray(small[..., ::-1])
+    return np.repeat(small[..., :1], 3, axis=2)
+
+
+def decode_color_grey(data: bytes, name: str) -> ImageArray:
+    """Grey ``[H, W]`` uint8 of an image in memory, the same pixels as `decode_color`. Raises FrameError."""
+    try:
+        if data.startswith(JPEG_START):  # its brightness is stored as such
+            return np.asarray(_decode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION), dtype=np.uint8)
+        return np.asarray(cv2.cvtColor(_decode_color(data, 1), cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+    except ImageFileError as error:
+        raise FrameError(f"{name}: {error}") from error
 
 
 def decode_16bit(data: bytes, name: str, size: tuple[int, int], what: str = "a depth image") -> npt.NDArray[np.uint16]:
@@ -253,15 +260,13 @@ def _encode(kind: str, pixels: npt.NDArray[Any], parameters: list[int]) -> bytes
 
 
 def read_bytes(path: Path) -> bytes:
-    """The bytes of a file. Raises FrameError when it is missing or cannot be read."""
+    """The bytes of an image file. Raises FrameError when it is missing, no file, too large or cannot be read."""
     try:
-        return path.read_bytes()
-    except FileNotFoundError as error:
+        return files.read_bytes(path, MOST_IMAGE_BYTES)
+    except files.MissingFileError as error:
         raise FrameError(f"{path}: no such file") from error
-    except IsADirectoryError as error:
-        raise FrameError(f"{path}: is a folder, not an image") from error
-    except OSError as error:
-        raise FrameError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnusableFileError as error:
+        raise FrameError(f"{path}: {error}") from error
 
 
 def read_query_image(path: Path) -> ImageArray:
@@ -272,3 +277,20 @@ def read_query_image(path: Path) -> ImageArray:
 def read_depth_image(path: Path, depth_scale: float, size: tuple[int, int]) -> Float32Array:
     """Depth ``[H, W]`` float32 metres of a 16-bit PNG file; see `decode_depth`. Raises FrameError naming the file."""
     return decode_depth(read_bytes(path), str(path), depth_scale, size)
+
+
+def remark_on_color(image: ImageArray) -> str | None:
+    """What people should know of an image that shows next to nothing; None of others."""
+    some = np.ascontiguousarray(image[::4, ::4])
+    if np.count_nonzero(some.max(axis=2) >= DARK) < 0.01 * some.shape[0] * some.shape[1]:
+        return "the colour image is nearly black"
+    if float(cv2.meanStdDev(some)[1].max()) < FLAT:
+        return "the colour image is nearly empty: one colour"
+    return None
+
+
+def remark_on_depth(depth: Float32Array) -> str | None:
+    """What people should know of a depth image with next to no depth; None of others."""
+    if np.isfinite(depth).mean() < LEAST_DEPTH:
+        return "the depth image is nearly empty"
+    return None

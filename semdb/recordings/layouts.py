@@ -6,19 +6,9 @@ from dataclasses import fields
 from pathlib import Path
 
 from semdb.errors import RecordingError, UsageError
-from semdb.recordings import (
-    icl_nuim,
-    nice_slam,
-    polycam,
-    record3d,
-    redwood,
-    ros_bag,
-    scannet,
-    seven_scenes,
-    stray_scanner,
-    tum,
-)
+from semdb.recordings import icl_nuim, nice_slam, polycam, record3d, redwood, scannet, seven_scenes, stray_scanner, tum
 from semdb.recordings.base import Layout, Recording
+from semdb.recordings.intrinsics import depth_scale_problem
 from semdb.recordings.options import ReadOptions, option_of
 from semdb.types import Camera
 
@@ -33,7 +23,6 @@ LAYOUTS: tuple[Layout, ...] = (
     scannet.FOLDER,
     nice_slam.LAYOUT,
     redwood.LAYOUT,
-    ros_bag.LAYOUT,
 )
 CHILDREN_LOOKED_AT = 200
 
@@ -50,6 +39,8 @@ def open_with(layout: Layout, path: Path, camera: Camera | None, options: ReadOp
         names = ", ".join(option_of(name) for name in foreign)
         fitting = [option_of(field.name) for field in fields(ReadOptions) if field.name in layout.takes]
         raise UsageError(f"{path}: {names} means nothing to a recording of format {layout.name}; it takes {fitting}")
+    if options.depth_scale is not None and (problem := depth_scale_problem(options.depth_scale)):
+        raise UsageError(f"--depth-scale: {problem}")
     return layout.open(path, camera, options)
 
 

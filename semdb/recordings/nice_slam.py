@@ -6,13 +6,13 @@ folder above; depth has 6553.5 units a metre.
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
 
 from semdb.errors import RecordingError
-from semdb.recordings.assembly import Draft, finish
+from semdb.files import UnusableFileError, read_json
+from semdb.recordings.assembly import Draft, finish, use_camera_file
 from semdb.recordings.association import bad_lines_note
 from semdb.recordings.base import Layout, Recording
 from semdb.recordings.numbered import entries_of, numbered_files
@@ -44,7 +44,8 @@ def open_nice_slam(path: Path, camera: Camera | None = None, options: ReadOption
     poses: dict[int, FloatArray | str] = {
         number: line if isinstance(line, str) else options.pose(line) for number, line in enumerate(lines)
     }
-    known, scale, notes = _parameters(path)
+    known, scale = _parameters(path)
+    notes = []
     if bad:
         notes.append(bad_lines_note("traj.txt", bad, "poses"))
     if not split["depth"]:
@@ -61,6 +62,11 @@ def open_nice_slam(path: Path, camera: Camera | None = None, options: ReadOption
         known_camera=known,
         depth_scale=options.depth_scale or scale,
     )
+    if known is None and not use_camera_file(draft, camera, options, path, path.resolve().parent):
+        draft.known_camera = REPLICA
+        draft.notes.append(
+            f"no {PARAMETERS}: taken for a rendering of Replica, 1200x680, f 600, {DEPTH_SCALE:g} units a metre"
+        )
     return finish(draft, camera)
 
 
@@ -69,21 +75,22 @@ def _number(file: Path, kind: str) -> list[int]:
     return [int(text)] if text.isdecimal() and file.suffix.lower() in (".jpg", ".png", ".jpeg") else []
 
 
-def _parameters(path: Path) -> tuple[Camera, float, list[str]]:
-    """Camera, depth scale and notes: of the parameter file beside or above the folder, else Replica's."""
+def _parameters(path: Path) -> tuple[Camera | None, float]:
+    """Camera and depth scale of the parameter file beside or above the folder; None and Replica's without."""
     for folder in (path, path.resolve().parent):
         file = folder / PARAMETERS
         if file.is_file():
-            return *_read_parameters(file), []
-    text = f"no {PARAMETERS}: taken for a rendering of Replica, 1200x680, f 600, {DEPTH_SCALE:g} units a metre"
-    return REPLICA, DEPTH_SCALE, [text]
+            return _read_parameters(file)
+    return None, DEPTH_SCALE
 
 
 def _read_parameters(file: Path) -> tuple[Camera, float]:
     try:
-        content: Any = json.loads(file.read_text(encoding="utf-8-sig"))["camera"]
+        content: Any = read_json(file)["camera"]
         values = {key: float(content[key]) for key in ("w", "h", "fx", "fy", "cx", "cy", "scale")}
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except UnusableFileError as error:
+        raise RecordingError(error.at(file)) from error
+    except (ValueError, KeyError, TypeError) as error:
         raise RecordingError(
             f"{file}: must be a JSON object with 'camera': w, h, fx, fy, cx, cy, scale ({error!r})"
         ) from error

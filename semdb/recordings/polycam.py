@@ -7,7 +7,6 @@ and undistorted images and are taken. Depth is 16-bit millimetres, smaller than 
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from semdb.errors import FrameError, RecordingError
+from semdb.files import UnusableFileError, read_json
 from semdb.recordings.assembly import Draft, finish
 from semdb.recordings.base import DroppedFrame, FrameEntry, Layout, RawColor, RawDepth, Recording
 from semdb.recordings.images import decode_gray, read_bytes, scaled_depth
@@ -132,8 +132,8 @@ def _has_files(folder: Path, kind: str) -> bool:
 def _read_camera(file: Path, options: ReadOptions) -> tuple[Camera, FloatArray]:
     """Intrinsics and pose of a keyframe. Raises ValueError with the reason."""
     try:
-        content: Any = json.loads(file.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError, RecursionError) as error:
+        content: Any = read_json(file)
+    except UnusableFileError as error:
         raise ValueError(f"cannot be read as JSON ({error})") from error
     keys = ["width", "height", "fx", "fy", "cx", "cy", *(f"t_{row}{column}" for row in range(3) for column in range(4))]
     if not isinstance(content, dict):

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semdb.errors import RecordingError
+from semdb.files import fields_of, parse_number
 from semdb.geometry import pose_from, project_to_so3
 from semdb.recordings.association import BadLine, read_lines
 from semdb.types import FloatArray
@@ -30,8 +31,9 @@ def rigid_pose(matrix: npt.ArrayLike) -> FloatArray:
     if m.shape == (4, 4) and np.abs(m[3] - (0, 0, 0, 1)).max() > 1e-6:
         raise ValueError("is no rigid motion: its last row is not 0 0 0 1")
     rotation = m[:3, :3]
-    off = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-    if off > ROTATION_TOLERANCE or np.linalg.det(rotation) <= 0:
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+    if not off <= ROTATION_TOLERANCE or np.linalg.det(rotation) <= 0:
         raise ValueError(f"is no rotation (R^T R differs from the identity by {off:.2g})")
     if np.abs(m[:3, 3]).max() > FARTHEST_M:
         raise ValueError("is farther than 1000 km from the origin")
@@ -39,11 +41,8 @@ def rigid_pose(matrix: npt.ArrayLike) -> FloatArray:
 
 
 def numbers_of(text: str) -> list[float]:
-    """The numbers of a line, between blanks or commas. Raises ValueError with the reason."""
-    try:
-        return [float(part) for part in text.replace(",", " ").split()]
-    except ValueError as error:
-        raise ValueError("has something that is no number") from error
+    """The numbers of a line; see `semdb.files.fields_of`. Raises ValueError with the reason."""
+    return [parse_number(part) for part in fields_of(text)[0]]
 
 
 def pose_of_numbers(values: Sequence[float]) -> FloatArray:

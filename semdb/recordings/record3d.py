@@ -8,7 +8,6 @@ bytes 0 to 2, both compressed by LZFSE.
 
 from __future__ import annotations
 
-import json
 import math
 import threading
 import zipfile
@@ -19,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from semdb.errors import FrameError, RecordingError
+from semdb.files import UnusableFileError, decode_text, parse_json
 from semdb.geometry import pose_from, rotation_from_quat_wxyz
 from semdb.recordings.assembly import Draft, finish
 from semdb.recordings.association import parse_pose
@@ -199,9 +199,9 @@ class _Record3dData:
 def _metadata(members: _Members) -> dict[str, Any]:
     where = f"{members.path}: {METADATA}"
     try:
-        content = json.loads(members.read(METADATA))
-    except (ValueError, RecursionError) as error:
-        raise RecordingError(f"{where}: is not JSON: {error}") from error
+        content = parse_json(decode_text(members.read(METADATA)))
+    except UnusableFileError as error:
+        raise RecordingError(f"{where}: {error}") from error
     except FrameError as error:
         raise RecordingError(str(error)) from error
     if not isinstance(content, dict):

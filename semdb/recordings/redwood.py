@@ -7,14 +7,14 @@ and the four lines of a camera-to-world matrix.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from semdb.errors import RecordingError
-from semdb.recordings.assembly import Draft, finish
+from semdb.files import UnusableFileError, read_json
+from semdb.recordings.assembly import Draft, finish, use_camera_file
 from semdb.recordings.association import read_lines
 from semdb.recordings.base import Layout, Recording
 from semdb.recordings.numbered import entries_of, numbered_files
@@ -42,7 +42,7 @@ def open_redwood(path: Path, camera: Camera | None = None, options: ReadOptions 
     color, depth = numbered_files(folder), numbered_files(path / "depth", (".png",))
     notes: list[str] = []
     poses = _poses(path, color, options, notes)
-    known = _intrinsics(path, notes)
+    known = _intrinsics(path)
     if not depth:
         notes.append("no images in depth/: the frames have no depth")
     entries, dropped = entries_of(path, color, depth or None, poses)
@@ -56,7 +56,13 @@ def open_redwood(path: Path, camera: Camera | None = None, options: ReadOptions 
         notes=notes,
         known_camera=known,
         depth_scale=options.depth_scale or DEPTH_SCALE,
+        assumed_scale="" if options.depth_scale else "Open3D's default",
     )
+    if known is None and not use_camera_file(draft, camera, options, path):
+        draft.known_camera = PRIME_SENSE
+        draft.notes.append(
+            "no intrinsic.json: taken for Open3D's default, a PrimeSense of 640x480, 525,525,319.5,239.5"
+        )
     return finish(draft, camera)
 
 
@@ -103,16 +109,18 @@ def _poses(
     return dict(zip(sorted(color), poses, strict=False))
 
 
-def _intrinsics(path: Path, notes: list[str]) -> Camera:
+def _intrinsics(path: Path) -> Camera | None:
     for name in INTRINSICS:
         file = path / name
         if not file.is_file():
             continue
         try:
-            content: Any = json.loads(file.read_text(encoding="utf-8-sig"))
+            content: Any = read_json(file)
             matrix = np.reshape([float(v) for v in content["intrinsic_matrix"]], (3, 3)).T
             size = int(content["width"]), int(content["height"])
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except UnusableFileError as error:
+            raise RecordingError(error.at(file)) from error
+        except (ValueError, KeyError, TypeError) as error:
             raise RecordingError(
                 f"{file}: must be a JSON object with width, height and the nine numbers of intrinsic_matrix "
                 f"({type(error).__name__}: {error})"
@@ -120,8 +128,7 @@ def _intrinsics(path: Path, notes: list[str]) -> Camera:
         if not np.isfinite(matrix).all() or min(matrix[0, 0], matrix[1, 1], *size) <= 0:
             raise RecordingError(f"{file}: has a number that makes no sense")
         return Camera(*size, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
-    notes.append("no intrinsic.json: taken for Open3D's default, a PrimeSense of 640x480, 525,525,319.5,239.5")
-    return PRIME_SENSE
+    return None
 
 
 LAYOUT = Layout(

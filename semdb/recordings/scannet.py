@@ -18,14 +18,16 @@ from typing import BinaryIO
 import numpy as np
 
 from semdb.errors import FrameError, RecordingError
+from semdb.files import UnusableFileError, open_regular
 from semdb.geometry import invert_pose
 from semdb.recordings.assembly import Draft, finish
 from semdb.recordings.base import DroppedFrame, FrameEntry, Layout, RawColor, RawDepth, Recording
+from semdb.recordings.camera_files import read_matrix
 from semdb.recordings.images import decode_16bit, read_bytes, scaled_depth
 from semdb.recordings.numbered import entries_of, numbered_files
 from semdb.recordings.options import ReadOptions
 from semdb.recordings.own_depth import DepthCamera, in_color
-from semdb.recordings.poses import numbers_of, rigid_pose
+from semdb.recordings.poses import rigid_pose
 from semdb.types import Camera, FloatArray
 
 VERSION = 4
@@ -75,7 +77,7 @@ def open_sens(path: Path, camera: Camera | None = None, options: ReadOptions | N
     file = path if path.is_file() else _sens_files(path)[0]
     notes: list[str] = []
     entries, dropped, frames = [], [], {}
-    with file.open("rb") as stream:
+    with _open(file) as stream:
         header = _read_header(stream, file)
         size = file.stat().st_size
         for index in range(header.frames):
@@ -218,6 +220,13 @@ def _sens_files(path: Path) -> list[Path]:
     return sorted(path.glob("*.sens"))
 
 
+def _open(file: Path) -> BinaryIO:
+    try:
+        return open_regular(file)
+    except UnusableFileError as error:
+        raise RecordingError(error.at(file)) from error
+
+
 def _read_header(stream: BinaryIO, file: Path) -> SensHeader:
     try:
         (version,) = struct.unpack("<I", stream.read(4))
@@ -278,10 +287,8 @@ def _rigid_or_identity(matrix: FloatArray) -> FloatArray:
 
 def _folder_pose(file: Path, options: ReadOptions) -> FloatArray | str:
     try:
-        return options.pose(
-            rigid_pose([numbers_of(line) for line in file.read_text("utf-8-sig").splitlines() if line.strip()])
-        )
-    except (ValueError, OSError) as error:
+        return options.pose(rigid_pose(read_matrix(file)))
+    except ValueError as error:
         return "its pose was lost" if "finite" in str(error) else f"pose/{file.name}: {error}"
 
 
@@ -291,11 +298,8 @@ def _matrix_camera(file: Path, size: tuple[int, int]) -> Camera:
 
 def _read_matrix(file: Path) -> FloatArray:
     try:
-        rows = [numbers_of(line) for line in file.read_text("utf-8-sig").splitlines() if line.strip()]
-        matrix = np.array(rows, dtype=np.float64)
-    except FileNotFoundError as error:
-        raise RecordingError(f"{file}: the file is missing; it has the 4x4 matrix of the intrinsics") from error
-    except (OSError, ValueError) as error:
+        matrix = read_matrix(file)
+    except ValueError as error:
         raise RecordingError(f"{file}: must have the numbers of a 4x4 matrix ({error})") from error
     if matrix.shape not in ((4, 4), (3, 3), (3, 4)):
         raise RecordingError(f"{file}: must have the numbers of a 4x4 matrix, but is {matrix.shape}")

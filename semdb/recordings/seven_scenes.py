@@ -13,17 +13,17 @@ from pathlib import Path
 import numpy as np
 
 from semdb.errors import RecordingError
-from semdb.geometry import pose_from, project_to_so3
-from semdb.recordings.assembly import Draft, finish, no_usable_frame
+from semdb.recordings.assembly import Draft, finish, no_usable_frame, use_camera_file
 from semdb.recordings.base import DroppedFrame, FrameEntry, Layout, Recording
+from semdb.recordings.camera_files import read_matrix
 from semdb.recordings.cameras import SEVEN_SCENES_COLOR, SEVEN_SCENES_DEPTH_SCALE
 from semdb.recordings.options import ReadOptions
+from semdb.recordings.poses import rigid_pose
 from semdb.recordings.registration import DEPTH_FROM_COLOR, REGISTRATION_7SCENES
 from semdb.types import Camera, FloatArray
 
-FRAME_FILE = re.compile(r"frame-(\d+)\.(color\.png|color\.jpg|color\.jpeg|depth\.png|pose\.txt)")
+FRAME_FILE = re.compile(r"frame-([0-9]+)\.(color\.png|color\.jpg|color\.jpeg|depth\.png|pose\.txt)")
 SEQUENCE = re.compile(r"seq-?\d+")
-ROTATION_TOLERANCE = 0.02  # published poses are off by up to 4e-4
 
 
 def is_seven_scenes(path: Path) -> bool:
@@ -46,6 +46,7 @@ def sequence_name(path: Path) -> str:
 def open_seven_scenes(path: Path, camera: Camera | None = None, options: ReadOptions | None = None) -> Recording:
     """One sequence of 7-Scenes. `camera`, when given, is the colour camera; the depth camera stays the known one.
 
+    Others name frames likewise: where a camera file lies beside them, depth and poses are of that camera.
     Frames have no times (`timestamp_ns` None). Frames without colour, depth or pose, or with a pose that is no
     rigid motion, are dropped; where no frame at all has depth (or a pose), all are kept without (noted).
     Raises RecordingError.
@@ -61,8 +62,10 @@ def open_seven_scenes(path: Path, camera: Camera | None = None, options: ReadOpt
         dropped=[],
         depth_registration=REGISTRATION_7SCENES,
         known_camera=SEVEN_SCENES_COLOR,
-        depth_scale=options.depth_scale or SEVEN_SCENES_DEPTH_SCALE,
+        depth_scale=SEVEN_SCENES_DEPTH_SCALE,
+        assumed_scale="that of 7-Scenes",
     )
+    _set_camera(draft, path, camera, options)
     has_depth = any("depth" in parts for parts in files.values())
     has_poses = any("pose" in parts for parts in files.values())
     if not has_depth:
@@ -70,7 +73,7 @@ def open_seven_scenes(path: Path, camera: Camera | None = None, options: ReadOpt
     if not has_poses:
         draft.notes.append("no frame-*.pose.txt: the frames have no pose and cannot become keyframes")
     for number, parts in sorted(files.items()):
-        entry = _entry(path, number, parts, has_depth, has_poses, options)
+        entry = _entry(draft, number, parts, has_depth, has_poses, options)
         if isinstance(entry, DroppedFrame):
             draft.dropped.append(entry)
         else:
@@ -82,28 +85,12 @@ def open_seven_scenes(path: Path, camera: Camera | None = None, options: ReadOpt
 
 def read_pose(path: Path) -> FloatArray:
     """The 4x4 matrix of a ``pose.txt``, its rotation projected to SO(3). Raises ValueError with the reason."""
-    try:
-        rows = [
-            [float(value) for value in line.split()] for line in path.read_text("utf-8").splitlines() if line.strip()
-        ]
-    except FileNotFoundError as error:
-        raise ValueError("the file is missing") from error
-    except OSError as error:
-        raise ValueError(f"the file cannot be read: {error.strerror}") from error
-    except ValueError as error:  # also what is no text
-        raise ValueError("has something that is no number") from error
-    if len(rows) != 4 or any(len(row) != 4 for row in rows):
+    matrix = read_matrix(path)
+    if matrix.shape in ((3, 4), (1, 12)):  # the last row says nothing
+        matrix = np.vstack([matrix.reshape(3, 4), (0, 0, 0, 1)])
+    if matrix.size != 16:
         raise ValueError("is no matrix of 4 by 4 numbers")
-    matrix = np.array(rows)
-    if not np.isfinite(matrix).all():
-        raise ValueError("has a number that is not finite")
-    rotation = matrix[:3, :3]
-    if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
-        raise ValueError("is no rigid motion: its last row is not 0 0 0 1")
-    off = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-    if off > ROTATION_TOLERANCE or np.linalg.det(rotation) <= 0:
-        raise ValueError(f"is no rotation (R^T R differs from the identity by {off:.2g})")
-    return pose_from(project_to_so3(rotation), matrix[:3, 3])
+    return rigid_pose(matrix.reshape(4, 4))
 
 
 def _list_frames(path: Path) -> dict[int, dict[str, str]]:
@@ -118,9 +105,23 @@ def _list_frames(path: Path) -> dict[int, dict[str, str]]:
     return files
 
 
+def _set_camera(draft: Draft, path: Path, camera: Camera | None, options: ReadOptions) -> None:
+    """A camera file beside the frames, or of the scene (3DMatch), takes the place of all that 7-Scenes' devices are."""
+    scene = (path.resolve().parent,) if SEQUENCE.fullmatch(path.resolve().name) else ()
+    if use_camera_file(draft, camera, options, path, *scene):
+        draft.depth_registration = ""
+        return
+    own = "" if camera is not None else "colour camera 525,525,320,240, "
+    draft.assumed.append(
+        f"camera: 7-Scenes', by the names of the files: {own}depth camera 585,585,320,240, whose pose the files hold "
+        "and which is registered to colour; where other cameras took the frames, put a camera.json beside them"
+    )
+
+
 def _entry(
-    path: Path, number: int, parts: dict[str, str], has_depth: bool, has_poses: bool, options: ReadOptions
+    draft: Draft, number: int, parts: dict[str, str], has_depth: bool, has_poses: bool, options: ReadOptions
 ) -> FrameEntry | DroppedFrame:
+    path = draft.path
     name = parts.get("color") or f"frame-{number:06d}"
     if "color" not in parts:
         return DroppedFrame(name, f"no colour image (only {', '.join(sorted(parts.values()))})")
@@ -131,7 +132,9 @@ def _entry(
         if "pose" not in parts:
             return DroppedFrame(name, "no pose.txt")
         try:
-            pose = options.pose(read_pose(path / parts["pose"])) @ DEPTH_FROM_COLOR
+            pose = options.pose(read_pose(path / parts["pose"]))
+            if draft.depth_registration:  # the files hold the depth camera's
+                pose = pose @ DEPTH_FROM_COLOR
         except ValueError as error:
             return DroppedFrame(name, f"{parts['pose']}: {error}")
     depth_path = path / parts["depth"] if "depth" in parts else None

@@ -2,37 +2,44 @@
 
 from __future__ import annotations
 
-import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from semdb.errors import RecordingError
-from semdb.recordings.assembly import Draft, finish
+from semdb.files import MissingFileError, UnusableFileError, read_json
+from semdb.names import written
+from semdb.recordings.assembly import Draft, finish, use_camera_file
 from semdb.recordings.association import (
+    ASSOCIATIONS,
     MAX_TIME_DIFFERENCE_NS,
     TimedFile,
     Trajectory,
     bad_lines_note,
+    has_times,
     nearest_pairs,
     pose_at,
+    read_associations,
     read_file_list,
     read_trajectory,
     turn_rate_at,
 )
 from semdb.recordings.base import DroppedFrame, FrameEntry, Layout, Recording
-from semdb.recordings.cameras import CAMERA_FILE, TUM_DEPTH_SCALE, read_camera_file, tum_camera
+from semdb.recordings.cameras import TUM_DEPTH_SCALE, tum_camera
 from semdb.recordings.options import ReadOptions
-from semdb.shown import measure
 from semdb.types import Camera
 
+_LABEL = re.compile(r"[0-9]{1,9}")
 LIMIT_MS = MAX_TIME_DIFFERENCE_NS / 1e6
 
 
 def is_tum(path: Path) -> bool:
-    """Whether a folder has TUM's list of colour images."""
-    return (path / "rgb.txt").is_file()
+    """Whether a folder has TUM's list of colour images, or one of pairs of images with times."""
+    if not path.is_dir():
+        return False
+    return (path / "rgb.txt").exists() or ((path / ASSOCIATIONS).exists() and has_times(path / ASSOCIATIONS))
 
 
 def open_tum(path: Path, camera: Camera | None = None, options: ReadOptions | None = None) -> Recording:
@@ -45,49 +52,52 @@ def open_tum(path: Path, camera: Camera | None = None, options: ReadOptions | No
     """
     options = options or ReadOptions()
     name = path.resolve().name
-    files, bad = read_file_list(path / "rgb.txt")
+    listed = "rgb.txt" if (path / "rgb.txt").exists() else ASSOCIATIONS
+    pairs: list[TimedFile] | None = None
+    if listed == ASSOCIATIONS:
+        files, pairs, bad = read_associations(path / listed)
+    else:
+        files, bad = read_file_list(path / listed)
     draft = Draft(
         path=path,
         name=name,
         format="tum",
         total_frames=len(files) + len(bad),
         entries=[],
-        dropped=[DroppedFrame(f"rgb.txt line {line.line}", line.reason) for line in bad],
+        dropped=[DroppedFrame(f"{listed} line {line.line}", line.reason) for line in bad],
         depth_scale=TUM_DEPTH_SCALE,
+        assumed_scale="that of TUM RGB-D",
     )
-    colour = _sorted_by_time(files, "rgb.txt", draft.notes)
-    depth = _read_depth_list(path, draft.notes, options)
+    colour = _sorted_by_time(files, listed, draft.notes)
+    depth = _read_depth_list(path, pairs, draft.notes, options)
     trajectory = _read_poses(path, draft.notes, options)
     draft.categories = read_categories(path)
     if draft.categories is not None:
         draft.format = "synthetic"
-    _set_camera(draft, path, name, camera)
-    draft.depth_scale = options.depth_scale or draft.depth_scale
-    _associate(draft, colour, depth, trajectory)
+    _set_camera(draft, path, name, camera, options)
+    _associate(draft, listed, colour, depth, trajectory)
     return finish(draft, camera)
 
 
 def read_categories(path: Path) -> dict[int, str] | None:
     """Class name of each mask label (``masks/classes.json``); None where there is no folder ``masks``."""
-    if not (path / "masks").is_dir():
+    if not (path / "masks").exists():
         return None
     file = path / "masks" / "classes.json"
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
+        content = read_json(file)
+    except MissingFileError as error:
         raise RecordingError(f'{file}: the file is missing; it names the labels: {{"1": "chair", ...}}') from error
-    except OSError as error:
-        raise RecordingError(f"{file}: cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise RecordingError(f"{file}: is not a text file") from error
-    except json.JSONDecodeError as error:
-        raise RecordingError(f"{file}, line {error.lineno}: is not JSON: {error.msg}") from error
+    except UnusableFileError as error:
+        raise RecordingError(error.at(file)) from error
     if not isinstance(content, dict):
         raise RecordingError(f'{file}: must be a JSON object {{"1": "chair", ...}}')
     categories = {}
     for key, value in content.items():
-        if not (key.isascii() and key.isdigit()) or not 1 <= int(key) <= 65535 or not isinstance(value, str):
-            raise RecordingError(f"{file}: key {key!r} must be a label from 1 to 65535 with a class name as text")
+        if not _LABEL.fullmatch(key) or not 1 <= int(key) <= 65535 or not isinstance(value, str):
+            raise RecordingError(f"{file}: key {key[:40]!r} must be a label from 1 to 65535 with a class name as text")
+        if value != written(value):
+            raise RecordingError(f"{file}: the class name of label {key} is no text: {value!r}")
         categories[int(key)] = value
     return categories
 
@@ -99,25 +109,29 @@ def _sorted_by_time(files: list[TimedFile], list_name: str, notes: list[str]) ->
     return ordered
 
 
-def _read_depth_list(path: Path, notes: list[str], options: ReadOptions) -> list[TimedFile] | None:
-    if not (path / "depth.txt").is_file():
+def _read_depth_list(
+    path: Path, pairs: list[TimedFile] | None, notes: list[str], options: ReadOptions
+) -> list[TimedFile] | None:
+    """Depth images in order of time, of `pairs` where the list of colour images names them too."""
+    if pairs is None and not (path / "depth.txt").exists():
         notes.append("no depth.txt: the frames have no depth")
         return None
-    files, bad = read_file_list(path / "depth.txt")
+    listed = "depth.txt" if pairs is None else ASSOCIATIONS
+    files, bad = read_file_list(path / listed) if pairs is None else (pairs, [])
     if bad:
-        notes.append(bad_lines_note("depth.txt", bad, "times or names"))
+        notes.append(bad_lines_note(listed, bad, "times or names"))
     if options.depth_offset_ms:
         shift = round(options.depth_offset_ms * 1e6)
         files = [replace(file, time_ns=file.time_ns + shift) for file in files]
-    ordered = _sorted_by_time(files, "depth.txt", notes)
+    ordered = _sorted_by_time(files, listed, notes)
     unique = [file for i, file in enumerate(ordered) if i == 0 or file.time_ns != ordered[i - 1].time_ns]
     if len(unique) < len(ordered):
-        notes.append(f"depth.txt: {len(ordered) - len(unique)} repeated time(s); the first image of each is kept")
+        notes.append(f"{listed}: {len(ordered) - len(unique)} repeated time(s); the first image of each is kept")
     return unique
 
 
 def _read_poses(path: Path, notes: list[str], options: ReadOptions) -> Trajectory | None:
-    if not (path / "groundtruth.txt").is_file():
+    if not (path / "groundtruth.txt").exists():
         notes.append("no groundtruth.txt: the frames have no pose and cannot become keyframes")
         return None
     trajectory, pose_notes = read_trajectory(path / "groundtruth.txt", options)
@@ -125,23 +139,31 @@ def _read_poses(path: Path, notes: list[str], options: ReadOptions) -> Trajector
     return trajectory
 
 
-def _set_camera(draft: Draft, path: Path, name: str, camera: Camera | None) -> None:
-    if (path / CAMERA_FILE).is_file():
-        draft.known_camera, draft.depth_scale = read_camera_file(path / CAMERA_FILE)
+def _set_camera(draft: Draft, path: Path, name: str, camera: Camera | None, options: ReadOptions) -> None:
+    if use_camera_file(draft, camera, options, path):
         return
     draft.known_camera, note = tum_camera(name)
-    if note and camera is None:
+    if camera is None and note:
         draft.notes.append(note)
+        draft.assumed.append(note)
+    elif camera is None:
+        draft.assumed.append(f"camera: that of the Kinect which the folder's name {name!r} stands for")
 
 
 def _associate(
-    draft: Draft, colour: list[TimedFile], depth: list[TimedFile] | None, trajectory: Trajectory | None
+    draft: Draft,
+    listed: str,
+    colour: list[TimedFile],
+    depth: list[TimedFile] | None,
+    trajectory: Trajectory | None,
 ) -> None:
     """Fills `draft` with the frames that have all the recording has, and drops the others."""
     kept: list[tuple[int, TimedFile]] = []
     for index, file in enumerate(colour):
         if kept and kept[-1][1].time_ns == file.time_ns:
-            draft.dropped.append(DroppedFrame(file.name, f"same time as {kept[-1][1].name} (rgb.txt line {file.line})"))
+            draft.dropped.append(
+                DroppedFrame(file.name, f"same time as {kept[-1][1].name} ({listed} line {file.line})")
+            )
         else:
             kept.append((index, file))
     partner: list[int | None] = [None] * len(kept)
@@ -151,14 +173,14 @@ def _associate(
         partner, gaps = nearest_pairs(times, np.array([file.time_ns for file in depth], dtype=np.int64))
     for (index, file), match, gap in zip(kept, partner, gaps.tolist(), strict=True):
         if depth is not None and match is None:
-            reason = f"no depth image within {LIMIT_MS:g} ms (the nearest: {_milliseconds(gap)} ms)"
+            reason = f"no depth image within {LIMIT_MS:g} ms (the nearest: {gap / 1e6:.1f} ms)"
             draft.dropped.append(DroppedFrame(file.name, reason))
             continue
         pose, turn_rate = None, None
         if trajectory is not None:
             pose, pose_gap = pose_at(trajectory, file.time_ns)
             if pose is None:
-                reason = f"no pose within {LIMIT_MS:g} ms (the nearest: {_milliseconds(pose_gap)} ms)"
+                reason = f"no pose within {LIMIT_MS:g} ms (the nearest: {pose_gap / 1e6:.1f} ms)"
                 draft.dropped.append(DroppedFrame(file.name, reason))
                 continue
             turn_rate = turn_rate_at(trajectory, file.time_ns)
@@ -174,10 +196,6 @@ def _associate(
                 turn_rate=turn_rate,
             )
         )
-
-
-def _milliseconds(gap_ns: int) -> str:
-    return measure(gap_ns / 1e6, 1, unless=(0.0, LIMIT_MS))
 
 
 LAYOUT = Layout(

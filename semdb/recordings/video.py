@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from semdb.errors import FrameError
+from semdb.recordings.headers import MOST_PIXELS
 from semdb.types import ImageArray
 
 
@@ -63,5 +64,9 @@ class Video:
         cv2.utils.logging.setLogLevel(level)
         if not capture.isOpened():
             raise FrameError(f"{self._path}: is no video that can be decoded")
+        if capture.get(cv2.CAP_PROP_FRAME_WIDTH) * capture.get(cv2.CAP_PROP_FRAME_HEIGHT) > MOST_PIXELS:
+            raise FrameError(
+                f"{self._path}: its pictures are too large: at most {MOST_PIXELS / 1e6:.0f} million pixels"
+            )
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         self._capture, self._next = capture, 0

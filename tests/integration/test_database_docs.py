@@ -16,7 +16,7 @@ from semdb.database.store import Store
 from semdb.settings import Settings
 from semdb.types import Localization, Verdict
 from tests.database_samples import MODELS, description, fill, plan, pose, record
-from tests.servers import TestServer
+from tests.mariadb import TestServer
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 COOKBOOK = re.findall(r"```sql\n(.*?)```", (DOCS / "sql.md").read_text(encoding="utf-8"), re.DOTALL)
@@ -61,11 +61,13 @@ def test_there_are_enough_questions() -> None:
     assert len(COOKBOOK) >= 12
 
 
-def test_every_query_of_the_cookbook_runs(store: Store, database_url: str, server_of_url: TestServer | None) -> None:
+def test_every_query_of_the_cookbook_runs(store: Store, database_url: str, request: pytest.FixtureRequest) -> None:
     _populate(store)
     settings = Settings(database_url=database_url)
+    server: TestServer | None = None
     names = {role: f"docs_{role}" for role in accounts.ROLES}
-    if server_of_url is not None:
+    if store.engine.dialect.name != "sqlite":
+        server = request.getfixturevalue("mariadb_server")
         made = accounts.plan_accounts(database_url, names=names)
         accounts.execute(database_url, made.statements)
         settings = Settings(database_url=database_url, reader_url=made.urls["reader"])
@@ -73,8 +75,8 @@ def test_every_query_of_the_cookbook_runs(store: Store, database_url: str, serve
         results = [run_readonly(settings, query) for query in COOKBOOK]
         answers = [(columns, list(rows)) for columns, rows in results]
     finally:
-        if server_of_url is not None:
-            server_of_url.execute(*(f"DROP USER '{name}'@'%'" for name in names.values()))
+        if server is not None:
+            server.execute(*(f"DROP USER '{name}'@'%'" for name in names.values()))
     for query, (_, rows) in zip(COOKBOOK, answers, strict=True):
         if "recording = 'second visit'" not in query:  # what is missing there depends on the seed
             assert rows, f"no rows: {query}"
