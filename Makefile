@@ -1,5 +1,5 @@
 # make demo   install the base into .venv and run the demonstration (no setting, no model file needed)
-# make test   install everything, MariaDB included, then lint, types and all tests
+# make test   install everything, MySQL and MariaDB included, then lint, types and all tests
 # make test-train   train a small detector on rendered rooms from random weights; 8 minutes on 2 cores
 # make lint   ruff and mypy            make lock    write requirements/constraints.txt anew
 # make bench  all benchmarks, on RECORDINGS="..." or a rendered room
@@ -13,7 +13,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 LOCK := requirements/constraints.txt
-# two processes: each starts a MariaDB of its own
+# two processes: each starts servers of its own
 PYTEST_ARGS ?= --numprocesses 2
 
 .PHONY: help demo test test-train unit lint services lock bench wheel clean

@@ -110,9 +110,10 @@ def databases(*, server: bool) -> Iterator[Callable[[], contextlib.AbstractConte
         return
     from semdb.database import schema
     from semdb.database.engine import make_engine
-    from tests.mariadb import private_server
+    from tests import servers
+    from tests.mariadb import MARIADB
 
-    with private_server(options=BUFFERS) as running:
+    with servers.server(MARIADB, *BUFFERS) as running:
 
         @contextlib.contextmanager
         def made() -> Iterator[str]:
@@ -183,13 +184,14 @@ def measure_writer(keyframes: int = 200) -> dict[str, Any]:
     from semdb.database.engine import make_engine
     from semdb.types import Camera
     from tests import database_samples as samples
-    from tests.mariadb import private_server
+    from tests import servers
+    from tests.mariadb import MARIADB
 
     camera = Camera(640, 480, 525, 525, 319.5, 239.5)
     categories = ["chair", "cup", "tv", "laptop", "person", "cup"]
     made = [samples.description(k, categories, keypoints=1500, vector_size=2048, camera=camera) for k in range(8)]
     records = [samples.record(k, described, image_size=150_000) for k, described in enumerate(made)]
-    with private_server(options=BUFFERS) as server, server.schema() as url:
+    with servers.server(MARIADB, *BUFFERS) as server, server.schema() as url:
         engine = make_engine(url)
         schema.upgrade(engine)
         engine.dispose()

@@ -1,8 +1,10 @@
 #!/usr/bin/env bash
-# The servers that the tests run on loopback: MariaDB with Galera, and Redis; zsh, to press TAB in it. Tests on another server name it in
+# The servers that the tests run on loopback: MariaDB with Galera and Redis from the distribution, and a MySQL in a folder
+# of its own (install-mysql.sh); zsh, to press TAB in it. Tests on other servers name them in SEMDB_TEST_MARIADB_URL and
 # SEMDB_TEST_MYSQL_URL; those that kill servers, and those of a cluster, need them here.
 set -euo pipefail
 PATH=$PATH:/usr/sbin:/usr/local/sbin
+here=$(dirname "$0")
 
 packages=()
 command -v mariadbd >/dev/null || packages+=(mariadb-server)
@@ -11,11 +13,15 @@ command -v rsync >/dev/null || packages+=(rsync)
 command -v redis-server >/dev/null || packages+=(redis-server)
 command -v zsh >/dev/null || packages+=(zsh)
 
-if [ ${#packages[@]} -gt 0 ] && ! "$(dirname "$0")/apt-install.sh" "${packages[@]}"; then
-  if command -v mariadbd >/dev/null || [ -n "${SEMDB_TEST_MYSQL_URL:-}" ]; then
+if [ ${#packages[@]} -gt 0 ] && ! "$here/apt-install.sh" "${packages[@]}"; then
+  if command -v mariadbd >/dev/null || [ -n "${SEMDB_TEST_MARIADB_URL:-}" ]; then
     echo "not installed: ${packages[*]}; the tests that need them fail or are skipped, and say so" >&2
   else
-    echo "the tests need MariaDB: install it, or set SEMDB_TEST_MYSQL_URL to a server and an account for tests" >&2
+    echo "the tests need MariaDB: install it, or set SEMDB_TEST_MARIADB_URL to a server and an account for tests" >&2
     exit 1
   fi
+fi
+
+if ! "$here/install-mysql.sh" && [ "${SEMDB_TEST_REQUIRE_MYSQL:-0}" != 0 ]; then
+  exit 1
 fi

@@ -41,7 +41,7 @@ def fill_big(store: Store) -> list[int]:
             rows.add_recording(map_ids[-1], planned.recording_id, (number * RECORDINGS + visit) * FRAMES)
     with store.engine.begin() as connection:
         rows.insert(connection)
-        names = ", ".join(rows.by_table)
+        names = ", ".join([*rows.by_table, tables.ingest_items.name])
         if connection.dialect.name == "sqlite":
             connection.exec_driver_sql("ANALYZE")
         else:

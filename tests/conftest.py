@@ -7,11 +7,14 @@ import os
 import signal
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 
-from tests.mariadb import MariaDBError, TestServer, server
+from tests.mariadb import MARIADB
+from tests.mysql import MYSQL
 from tests.rooms import render
+from tests.servers import Kind, ServerError, TestServer, server_for_tests
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
@@ -32,28 +35,98 @@ def shared_dir() -> Path:
 
 @pytest.fixture(scope="session")
 def mariadb_server() -> Iterator[TestServer]:
-    """A MariaDB of the tests' own (one per process), or the server of SEMDB_TEST_MYSQL_URL; fails without either."""
+    """A MariaDB of the tests' own (one per process), or that of SEMDB_TEST_MARIADB_URL; fails without either."""
+    with _running(MARIADB) as server:
+        yield server
+
+
+@pytest.fixture(scope="session")
+def mysql_server() -> Iterator[TestServer]:
+    """A MySQL of the tests' own (one per process), or that of SEMDB_TEST_MYSQL_URL.
+
+    Without either it skips, or fails where SEMDB_TEST_REQUIRE_MYSQL is set.
+    """
+    with _running(MYSQL) as server:
+        yield server
+
+
+@contextlib.contextmanager
+def _running(kind: Kind) -> Iterator[TestServer]:
     with contextlib.ExitStack() as stack:
         try:
-            started = stack.enter_context(server())
-        except MariaDBError as error:
-            pytest.fail(str(error), pytrace=False)
-        yield started
+            server = stack.enter_context(server_for_tests(kind))
+        except ServerError as error:
+            _give_up(kind, error)
+        yield server
+
+
+def _give_up(kind: Kind, error: ServerError) -> NoReturn:
+    if kind is MYSQL and os.environ.get("SEMDB_TEST_REQUIRE_MYSQL", "0") in ("", "0"):
+        pytest.skip(str(error))
+    pytest.fail(str(error), pytrace=False)
+
+
+@pytest.fixture(scope="module", params=[MARIADB, MYSQL], ids=lambda kind: kind.name)
+def server_kind(request: pytest.FixtureRequest) -> Kind:
+    """Each kind of server in turn, for tests that start their own."""
+    kind: Kind = request.param
+    try:
+        kind.command()
+    except ServerError as error:
+        _give_up(kind, error)
+    return kind
+
+
+@pytest.fixture(params=["mariadb", "mysql"])
+def database_server(request: pytest.FixtureRequest) -> TestServer:
+    """Each server in turn."""
+    return request.getfixturevalue(f"{request.param}_server")  # type: ignore[no-any-return]
+
+
+@pytest.fixture
+def server_url(database_server: TestServer) -> Iterator[str]:
+    """The URL of a new, empty schema, on each server in turn."""
+    with database_server.schema() as url:
+        yield url
 
 
 @pytest.fixture
 def mariadb_url(mariadb_server: TestServer) -> Iterator[str]:
-    """The URL of a new, empty schema."""
+    """The URL of a new, empty schema of MariaDB."""
     with mariadb_server.schema() as url:
         yield url
 
 
-@pytest.fixture(params=["sqlite", "mariadb"])
+@pytest.fixture
+def mysql_url(mysql_server: TestServer) -> Iterator[str]:
+    """The URL of a new, empty schema of MySQL."""
+    with mysql_server.schema() as url:
+        yield url
+
+
+@pytest.fixture
+def any_server_url(request: pytest.FixtureRequest) -> str:
+    """The URL of a new, empty schema of MySQL, or of MariaDB where there is no MySQL."""
+    try:
+        found = bool(os.environ.get(MYSQL.variable) or MYSQL.command())
+    except ServerError:
+        found = False
+    return str(request.getfixturevalue("mysql_url" if found else "mariadb_url"))
+
+
+@pytest.fixture(params=["sqlite", "mariadb", "mysql"])
 def empty_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     """The URL of a database without a schema, on each server in turn."""
     if request.param == "sqlite":
         return f"sqlite:///{tmp_path / 'semdb.sqlite3'}"
-    return str(request.getfixturevalue("mariadb_url"))
+    return str(request.getfixturevalue(f"{request.param}_url"))
+
+
+@pytest.fixture
+def server_of_url(request: pytest.FixtureRequest, empty_url: str) -> TestServer | None:
+    """The server that `empty_url` is on; None for SQLite."""
+    kind = request.node.callspec.params["empty_url"]
+    return None if kind == "sqlite" else request.getfixturevalue(f"{kind}_server")
 
 
 @pytest.fixture(scope="session")

@@ -33,7 +33,7 @@ class PlanCheck:
         everything = _CONDITION.search(statement) is None
         cursor = connection.connection.cursor()
         try:
-            look = _sqlite if connection.dialect.name == "sqlite" else _mariadb
+            look = _sqlite if connection.dialect.name == "sqlite" else _server
             found = list(look(cursor, statement, parameters, everything))
         finally:
             cursor.close()
@@ -55,8 +55,8 @@ def checked_plans() -> Iterator[PlanCheck]:
         event.remove(Engine, "before_cursor_execute", before)
 
 
-def _mariadb(cursor: Any, statement: str, parameters: Any, everything: bool) -> Iterator[str]:
-    cursor.execute("EXPLAIN " + statement, parameters or None)
+def _server(cursor: Any, statement: str, parameters: Any, everything: bool) -> Iterator[str]:
+    cursor.execute("EXPLAIN FORMAT=TRADITIONAL " + statement, parameters or None)
     names = [column[0] for column in cursor.description]
     for row in (dict(zip(names, values, strict=True)) for values in cursor.fetchall()):
         if row["type"] not in _FULL_SCANS or int(row["rows"] or 0) <= SMALL or str(row["table"]).startswith("<"):

@@ -10,7 +10,7 @@ from celery import signals
 from semdb.database import retry
 from semdb.database.store import open_store
 from semdb.errors import SemdbError
-from semdb.events import LOGGER, JsonFormatter, event
+from semdb.events import LOGGER, JsonFormatter, PlainFormatter, event
 from semdb.ingestion.queue import sweep
 from semdb.settings import Settings
 
@@ -35,9 +35,14 @@ def _load() -> None:
 @signals.after_setup_logger.connect  # type: ignore[untyped-decorator]
 def _logs(logger: logging.Logger, **_: Any) -> None:
     LOGGER.setLevel(logging.INFO)
-    if Settings().log_format == "json":
-        for handler in (*logger.handlers, *LOGGER.handlers):
-            handler.setFormatter(JsonFormatter())
+    in_json = Settings().log_format == "json"
+    for handler in (*logger.handlers, *LOGGER.handlers):
+        handler.setFormatter(JsonFormatter() if in_json else _plain(handler.formatter))
+
+
+def _plain(formatter: logging.Formatter | None) -> logging.Formatter:
+    """Celery's own lines, in which names are no code either."""
+    return formatter if isinstance(formatter, PlainFormatter) else PlainFormatter(formatter)
 
 
 @signals.after_setup_task_logger.connect  # type: ignore[untyped-decorator]

@@ -50,7 +50,7 @@ def ingest_items(self: Any, recording_id: int, source: str, frames: Sequence[int
         metrics.count(item)
         log_item(recording_id, item)
 
-    what = {"recording": recording_id, "frames": len(frames)}
+    what: dict[str, Any] = {"recording": recording_id, "frames": len(frames)}
     try:
         if not _workplaces:
             _workplaces.append(Workplace(Settings()))

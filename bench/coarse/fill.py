@@ -21,7 +21,7 @@ from semdb.database.codecs import encode_array, encode_mask
 from semdb.database.engine import make_engine
 from semdb.database.ids import camera_row, model_row
 from semdb.types import Camera, ModelInfo
-from tests.mariadb import TestServer
+from tests.servers import TestServer
 
 MAP = "made-up"
 VERSION = 2  # of what is filled in: a kept server that holds another one is filled anew

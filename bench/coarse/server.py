@@ -7,7 +7,8 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from tests.mariadb import TestServer, private_server
+from tests.mariadb import MARIADB
+from tests.servers import TestServer, server
 
 OPTIONS = (
     "--innodb-buffer-pool-size=2G",  # the rows of a million keyframes without their vectors
@@ -24,4 +25,4 @@ def bench_server(keep: Path | None) -> Iterator[TestServer]:
     """A MariaDB on loopback whose data stay in `keep`, or go with it."""
     with contextlib.ExitStack() as stack:
         folder = keep or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="semdb-coarse-")))
-        yield stack.enter_context(private_server(folder.resolve(), OPTIONS))
+        yield stack.enter_context(server(MARIADB, *OPTIONS, keep=folder.resolve()))

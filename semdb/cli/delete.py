@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from semdb.cli.options import Overrides, settings_options
+from semdb.cli.output import print_lines
+from semdb.shown import for_terminal
 
 if TYPE_CHECKING:
     from semdb.database.records import RecordingStatus
@@ -32,8 +34,8 @@ def confirm(question: str, yes: bool) -> None:
         return
     if not sys.stdin.isatty():
         raise UsageError(f"{question} Nobody can answer here: give --yes")
-    if not typer.confirm(question, err=True):
-        print("nothing was deleted")
+    if not typer.confirm(for_terminal(question), err=True):
+        print_lines("nothing was deleted")
         raise typer.Exit(1)
 
 
@@ -71,7 +73,7 @@ def delete_recording(
         confirm(f"Delete the recording {found.map}/{found.name} with {found.keyframes} keyframes?", yes)
         with Progress(f"deleting {found.name}", "keyframes") as progress:
             deleted = store.delete_recording(found.recording_id, progress.update)
-        print(f"deleted the recording {found.map}/{found.name}: {deleted.keyframes} keyframes")
+        print_lines(f"deleted the recording {found.map}/{found.name}: {deleted.keyframes} keyframes")
 
 
 @command.command("map")
@@ -88,7 +90,7 @@ def delete_map(
         confirm(f"Delete the map {name} with {found.recordings} recordings, {found.keyframes} keyframes?", yes)
         with Progress(f"deleting {name}", "keyframes") as progress:
             deleted = store.delete_map(found.id, progress.update)
-        print(f"deleted the map {name}: {deleted.recordings} recordings, {deleted.keyframes} keyframes")
+        print_lines(f"deleted the map {name}: {deleted.recordings} recordings, {deleted.keyframes} keyframes")
 
 
 @command.command("keyframes")
@@ -108,4 +110,4 @@ def delete_keyframes(
         confirm(f"Delete {len(wanted)} keyframes?", yes)
         with Progress("deleting", "keyframes") as progress:
             number = store.delete_keyframes(wanted, progress.update)
-        print(f"deleted {number} keyframes")
+        print_lines(f"deleted {number} keyframes")

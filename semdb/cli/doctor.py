@@ -35,7 +35,8 @@ def command(overrides: Overrides, json: JsonFlag = False) -> None:
 
     Exit code 1 when something is wrong.
     """
-    from semdb.cli.output import print_json
+    from semdb.cli.output import print_json, print_lines
+    from semdb.cli.progress import say
 
     settings, checked_broker = settings_of(overrides)
     parts = (versions, database, checked_broker, folders, models)
@@ -45,10 +46,10 @@ def command(overrides: Overrides, json: JsonFlag = False) -> None:
     else:
         width = max(len(check.what) for check in checks)
         for check in checks:
-            print(f"{check.state:<8} {check.what:<{width}}  {check.text}")
+            print_lines(f"{check.state:<8} {check.what:<{width}}  {check.text}")
     problems = sum(check.state == "problem" for check in checks)
     if problems:
-        print(f"semdb: {problems} problem{'s' if problems > 1 else ''} found", file=sys.stderr)
+        say(f"{problems} problem{'s' if problems > 1 else ''} found")
         raise typer.Exit(1)
 
 

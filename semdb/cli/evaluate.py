@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from semdb.cli.options import CameraOption, Overrides, Reading, reading_options, settings_options
+from semdb.shown import number
 
 if TYPE_CHECKING:
     from semdb.evaluation.metrics import EvaluationResult
@@ -254,7 +255,7 @@ def used_settings(settings: Settings, options: EvaluateOptions) -> dict[str, str
         "query depth": "yes" if options.query_depth else "no",
         "truth": options.truth,
         "database": settings.database_url.partition(":")[0],
-        "score threshold": f"{settings.score_threshold:g}",
+        "score threshold": number(settings.score_threshold),
         "keypoints per image": f"{settings.max_keypoints} at most",
         "threads": str(settings.threads),
     }

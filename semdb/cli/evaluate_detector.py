@@ -24,7 +24,7 @@ def command(
     import json
     from dataclasses import asdict
 
-    from semdb.cli.output import print_table
+    from semdb.cli.output import print_lines, print_table, to_jsonable
     from semdb.cli.progress import Progress
     from semdb.cli.train import classes_of
     from semdb.perception.detectors import load_detector
@@ -37,8 +37,9 @@ def command(
     with Progress("detecting", unit="images") as progress:
         found = evaluate_detector(loaded, data, progress.update)
     if json_file is not None:
-        json_file.write_text(json.dumps({"detector": loaded.info.name, "data": str(data.file), **asdict(found)}) + "\n")
-    print(f"{loaded.info.name} on {data.file}: {found.images} images, {found.objects} objects")
+        scores = to_jsonable({"detector": loaded.info.name, "data": str(data.file), **asdict(found)})
+        json_file.write_text(json.dumps(scores) + "\n")
+    print_lines(f"{loaded.info.name} on {data.file}: {found.images} images, {found.objects} objects")
     rows = [
         [what, *(f"{value:.3f}" for value in scores.values)]
         for what, scores in (
@@ -49,4 +50,4 @@ def command(
         )
     ]
     print_table(("", *MEASURES), rows)
-    print("AP50 of boxes: " + ", ".join(f"{name} {value:.3f}" for name, value in found.class_ap50.items()))
+    print_lines("AP50 of boxes: " + ", ".join(f"{name} {value:.3f}" for name, value in found.class_ap50.items()))

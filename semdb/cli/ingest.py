@@ -9,6 +9,7 @@ import typer
 
 from semdb.cli.ending import ends_when_told
 from semdb.cli.options import CameraOption, JsonFlag, Overrides, Reading, reading_options, settings_options
+from semdb.shown import measure
 
 if TYPE_CHECKING:
     from semdb.ingestion.queue import Send
@@ -49,7 +50,7 @@ def command(
     json: JsonFlag = False,
 ) -> None:
     """Select keyframes, describe them and store them. Running it again adds nothing; cut off, it goes on."""
-    from semdb.cli.output import print_json
+    from semdb.cli.output import print_json, print_lines
     from semdb.cli.progress import StagedProgress, say
     from semdb.errors import UsageError
     from semdb.events import log_to
@@ -88,11 +89,12 @@ def command(
         else:
             summaries = ingest_recordings(paths, settings, options, progress=progress.update, say=say)
     if queue and not json:
-        print("\n".join(queued_text(summary) for summary in summaries))
+        print_lines(*(queued_text(summary) for summary in summaries))
     elif json:
         print_json([as_json(summary) for summary in summaries])
     else:
-        print("\n\n".join(as_text(summary) for summary in summaries))
+        for position, summary in enumerate(summaries):
+            print_lines(*[""] * (position > 0), *as_lines(summary))
     if any(summary.failed for summary in summaries):
         raise typer.Exit(1)
 
@@ -109,7 +111,7 @@ def _send() -> Send:
 
 
 def _resume(settings: Settings, *, json: bool) -> None:
-    from semdb.cli.output import print_json
+    from semdb.cli.output import print_json, print_lines
     from semdb.database.store import open_store
     from semdb.ingestion.queue import sweep
 
@@ -118,7 +120,7 @@ def _resume(settings: Settings, *, json: bool) -> None:
     if json:
         print_json({"sent": sent})
     else:
-        print(f"sent {sent} keyframes to the workers" if sent else "nothing is left to send")
+        print_lines(f"sent {sent} keyframes to the workers" if sent else "nothing is left to send")
 
 
 def queued_text(summary: IngestSummary) -> str:
@@ -152,14 +154,16 @@ def as_json(summary: IngestSummary) -> dict[str, object]:
     }
 
 
-def as_text(summary: IngestSummary) -> str:
+def as_lines(summary: IngestSummary) -> list[str]:
     """What is printed for people."""
     from semdb.cli.recording import group_dropped
 
     seconds = summary.seconds
-    rate = f", {summary.stored / seconds['total']:.1f} keyframes/s" if summary.stored and seconds["total"] else ""
+    rate = (
+        f", {measure(summary.stored / seconds['total'], 1)} keyframes/s" if summary.stored and seconds["total"] else ""
+    )
     stages = ", ".join(f"{name} {seconds[name]:.1f}" for name in ("read", "detect", "encode", "features", "store"))
-    lines = [
+    return [
         f"recording  {summary.recording} in map {summary.map_name}",
         f"frames     {summary.total_frames}, usable {summary.usable_frames}, dropped {len(summary.dropped)}",
         *(f"           {line}" for line in group_dropped(summary.dropped)),
@@ -170,4 +174,3 @@ def as_text(summary: IngestSummary) -> str:
         f"models     {', '.join(model.name for model in summary.models)}",
         f"seconds    {seconds['total']:.1f}{rate}; selection {seconds['select']:.1f}; {stages}",
     ]
-    return "\n".join(lines)

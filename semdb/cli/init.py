@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from semdb.cli.options import Overrides, settings_options
+from semdb.cli.output import print_lines
 
 
 @settings_options(models=False)
@@ -39,17 +40,17 @@ def _accounts(url: str, execute: bool) -> None:
     plan = plan_accounts(url)
     if execute:
         run_statements(url, plan.statements)
-        print("created the accounts; nothing else remembers their passwords:")
+        print_lines("created the accounts; nothing else remembers their passwords:")
     else:
         for statement in plan.statements:
-            print(f"{statement};")
+            print_lines(f"{statement};")
     variables = {
         "owner": "SEMDB_DATABASE_URL of semdb init",
         "writer": "SEMDB_DATABASE_URL",
         "reader": "SEMDB_READER_URL",
     }
     for role, account_url in plan.urls.items():
-        print(f"{'' if execute else '-- '}{role} ({variables[role]}): {account_url}")
+        print_lines(f"{'' if execute else '-- '}{role} ({variables[role]}): {account_url}")
 
 
 def _init(url: str) -> None:
@@ -64,8 +65,8 @@ def _init(url: str) -> None:
     finally:
         engine.dispose()
     if before is None:
-        print(f"created the schema, revision {schema.HEAD}, in {where}")
+        print_lines(f"created the schema, revision {schema.HEAD}, in {where}")
     elif before != schema.HEAD:
-        print(f"upgraded the schema of {where} from revision {before} to {schema.HEAD}")
+        print_lines(f"upgraded the schema of {where} from revision {before} to {schema.HEAD}")
     else:
-        print(f"the schema of {where} is up to date (revision {schema.HEAD})")
+        print_lines(f"the schema of {where} is up to date (revision {schema.HEAD})")

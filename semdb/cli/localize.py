@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from semdb.cli.options import CameraOption, JsonFlag, Overrides, settings_options
+from semdb.shown import measure
 
 if TYPE_CHECKING:
     from semdb.errors import FrameError
@@ -40,7 +41,7 @@ def command(
 
     An image that cannot be read is named on stderr and makes the exit code 1; the others are localized all the same.
     """
-    from semdb.cli.output import print_json
+    from semdb.cli.output import print_json, print_lines
     from semdb.cli.progress import say
     from semdb.database.store import open_store
     from semdb.localization.images import LocalizeOptions, localize_images
@@ -63,7 +64,7 @@ def command(
             if json:
                 results.append(as_json(answer))
             else:
-                print(as_text(answer), flush=True)
+                print_lines(*as_lines(answer))
             if plot is not None:
                 from semdb.pictures.localization import write_picture
 
@@ -110,14 +111,14 @@ def as_json(answer: ImageLocalization) -> dict[str, Any]:
     }
 
 
-def as_text(answer: ImageLocalization) -> str:
+def as_lines(answer: ImageLocalization) -> list[str]:
     """What is printed for people."""
     from semdb.geometry import quat_wxyz_from_rotation
 
     found = answer.localization
     lines = [
         f"{answer.query.path}",
-        f"  verdict     {found.verdict} (confidence {found.confidence:.2f}): {found.reason}",
+        f"  verdict     {found.verdict} (confidence {measure(found.confidence, 2, unless=(0.0, 1.0))}): {found.reason}",
     ]
     if found.world_from_camera is not None:
         position = " ".join(f"{value:.4f}" for value in found.world_from_camera[:3, 3])
@@ -128,14 +129,15 @@ def as_text(answer: ImageLocalization) -> str:
         ]
     named = [f"{c.recording}/{c.frame_index} ({c.inliers})" for c in found.candidates]
     spent = ", ".join(f"{stage} {value:.0f}" for stage, value in found.timing_ms.items())
-    lines += [
+    return [
+        *lines,
         f"  candidates  {', '.join(named) or 'none'} (inliers), stage {found.stage}",
         f"  ms          {spent}",
     ]
-    return "\n".join(lines)
 
 
 def _sigma(covariance: Any) -> str:
     if covariance is None:
         return ""
-    return f" +- {1000 * float(max(covariance[i, i] for i in range(3))) ** 0.5:.1f} mm"
+    sigma_m = float(max(covariance[i, i] for i in range(3))) ** 0.5
+    return f" +- {measure(1000 * sigma_m, 1)} mm"

@@ -18,6 +18,7 @@ import typer
 from typer.core import TyperGroup
 
 from semdb.errors import SemdbError
+from semdb.shown import for_terminal
 
 # name -> module[:attribute], in the order of the help; the attribute is `command` unless it says otherwise
 COMMANDS: dict[str, str] = {
@@ -58,18 +59,23 @@ def load_command(name: str) -> Any:
 def report(error: BaseException) -> int:
     """Print what went wrong on stderr, one line without a traceback (``SEMDB_DEBUG=1`` shows it); the exit code."""
     if os.environ.get("SEMDB_DEBUG", "") not in {"", "0"}:
-        traceback.print_exception(error)
+        for line in "".join(traceback.format_exception(error)).splitlines():
+            print(for_terminal(line), file=sys.stderr)
     if isinstance(error, KeyboardInterrupt):
         print("semdb: interrupted", file=sys.stderr)
         return INTERRUPTED
     if isinstance(error, SemdbError):
-        print(f"semdb: {error}", file=sys.stderr)
+        print(f"semdb: {for_terminal(error)}", file=sys.stderr)
         return error.exit_code
     if isinstance(error, OSError):
-        name = f"{error.filename}: " if error.filename else ""
-        print(f"semdb: {name}{error.strerror or error}", file=sys.stderr)
+        name = f"{os.fsdecode(error.filename)}: " if isinstance(error.filename, str | bytes | os.PathLike) else ""
+        print(f"semdb: {for_terminal(f'{name}{error.strerror or error}')}", file=sys.stderr)
         return 1
     raise error
+
+
+# What typer raises for a command line that it cannot read; its message names words of it as they are.
+_Misuse: Any = typer.BadParameter.__base__
 
 
 class CommandGroup(TyperGroup):
@@ -91,13 +97,26 @@ class CommandGroup(TyperGroup):
             self._loaded[cmd_name] = load_command(cmd_name)
         return self._loaded[cmd_name]
 
+    def make_context(self, *given: Any, **more: Any) -> Any:
+        try:
+            return super().make_context(*given, **more)
+        except _Misuse as error:
+            raise _plain(error) from None
+
     def invoke(self, ctx: Any) -> Any:
         try:
             return super().invoke(ctx)
+        except _Misuse as error:
+            raise _plain(error) from None
         except (SemdbError, OSError, KeyboardInterrupt) as error:
             if isinstance(error, OSError) and error.errno == errno.EPIPE:
                 raise  # the reader of a pipe went away: typer ends quietly
             raise typer.Exit(report(error)) from None
+
+
+def _plain(error: Any) -> Any:
+    error.message = for_terminal(error.message)
+    return error
 
 
 app = typer.Typer(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from semdb.cli.options import JsonFlag, Overrides, settings_options
+from semdb.cli.output import print_json, print_lines, print_table
 from semdb.errors import UsageError
 
 if TYPE_CHECKING:
@@ -46,8 +47,6 @@ def group() -> None:
 @settings_options(models=True)
 def list_models(overrides: Overrides, json: JsonFlag = False) -> None:
     """List the specs that settings can name, the model files at hand, and which models made the rows of each map."""
-    from semdb.cli.output import print_json, print_table
-
     settings = overrides.settings()
     chosen = {role: str(getattr(settings, role)) for role in ("detector", "encoder", "features")}
     used = used_models(settings.database_url)
@@ -57,7 +56,7 @@ def list_models(overrides: Overrides, json: JsonFlag = False) -> None:
         print_json({"specs": specs, "settings": chosen, "files": files, "maps": used})
         return
     print_table(("role", "spec", "description"), [(role, spec, text) for role, spec, _, text in SPECS])
-    print("\nset: " + ", ".join(f"{role} {spec}" for role, spec in chosen.items()) + "\n")
+    print_lines("", "set: " + ", ".join(f"{role} {spec}" for role, spec in chosen.items()), "")
     print_table(
         ("file", "spec", "at hand", "sha256", "licence", "made the rows of"),
         [
@@ -65,11 +64,11 @@ def list_models(overrides: Overrides, json: JsonFlag = False) -> None:
             for f in files
         ],
     )
-    print(f"\nfolder: {files_folder(settings)}; `semdb models pull NAME` fetches what is not at hand")
+    print_lines("", f"folder: {files_folder(settings)}; `semdb models pull NAME` fetches what is not at hand")
     if not used:
-        print("maps: " + ("no database yet" if used is None else "none yet"))
+        print_lines("maps: " + ("no database yet" if used is None else "none yet"))
         return
-    print()
+    print_lines("")
     columns = ("map", "role", "name", "sha256", "config")
     print_table(columns, [(u["map"], u["role"], u["name"], u["sha256"][:12], u["config"]) for u in used])
 
@@ -95,7 +94,7 @@ def pull_models(
     for model in PUBLISHED if "all" in names else [BY_NAME[name] for name in dict.fromkeys(names)]:
         with Bar(f"pulling {model.name}", unit="MB") as progress:
             done = pull(model, folder, functools.partial(_show_megabytes, progress))
-        print(
+        print_lines(
             f"{model.name}: {'pulled' if done.fetched else 'there already'}, {done.path}, sha256 {done.sha256[:16]}…"
             + (" (recorded: its publisher gives none)" if done.recorded else ", as it should be")
             + f"; licence {model.licence}; use it as {model.spec}"
@@ -123,13 +122,13 @@ def export_model(
 
     settings = load_settings()
     done = export(spec, target, settings)
-    print(f"{done.role} {spec} is {done.path}, sha256 {done.sha256[:16]}…; use it as onnx:{done.path}")
+    print_lines(f"{done.role} {spec} is {done.path}, sha256 {done.sha256[:16]}…; use it as onnx:{done.path}")
     if not check:
         say("not compared with the original: --check IMAGE or --check RECORDING does that")
         return
     pictures = _pictures(check, images)
     with Progress("comparing", unit="images") as progress:
-        print(check_export(done, spec, pictures, settings, progress.update))
+        print_lines(check_export(done, spec, pictures, settings, progress.update))
 
 
 def _pictures(paths: list[Path], count: int) -> list[ImageArray]:

@@ -1,4 +1,4 @@
-"""What commands print on stdout: aligned tables for people, CSV and JSON for programs."""
+"""What commands print on stdout: lines and aligned tables for people, CSV and JSON for programs."""
 
 from __future__ import annotations
 
@@ -6,65 +6,101 @@ import csv
 import json
 import math
 import sys
+from collections import Counter
 from collections.abc import Iterable, Sequence
-from datetime import date, datetime
+from datetime import date, datetime, time, timedelta
 from decimal import Decimal
 from typing import Any, TextIO
+
+from semdb.shown import for_json, for_terminal, number, width
 
 FORMATS = ("table", "csv", "json")
 
 
 def to_jsonable(value: Any) -> Any:
-    """`value` with what JSON cannot hold replaced: NaN and infinities by null, bytes by hex, times by ISO 8601."""
+    """`value` with what JSON cannot hold replaced: NaN and infinities by null, bytes by hex, times by ISO 8601.
+
+    A decimal of a database is a number where one of eight bytes holds it exactly, else a text with all its digits.
+    """
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
         return {str(key): to_jsonable(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [to_jsonable(item) for item in value]
-    if isinstance(value, bytes):
-        return value.hex()
-    if isinstance(value, datetime | date):
+    if isinstance(value, bytes | bytearray | memoryview):
+        return bytes(value).hex()
+    if isinstance(value, datetime | date | time):
         return value.isoformat()
+    if isinstance(value, timedelta):
+        return _span(value)
     if isinstance(value, Decimal):  # what servers return for SUM and AVG
-        return int(value) if value == value.to_integral_value() else float(value)
+        return _decimal(value)
     if hasattr(value, "tolist"):  # numpy scalars and arrays
         return to_jsonable(value.tolist())
     return value
 
 
+def _decimal(value: Decimal) -> int | float | str | None:
+    if not value.is_finite():
+        return None
+    if value == value.to_integral_value():
+        return int(value)
+    return float(value) if Decimal(repr(float(value))) == value else number(value)
+
+
+def _span(value: timedelta) -> str:
+    """A TIME of a server as it writes it: ``-26:03:04.5``, hours first, however many."""
+    microseconds = abs(value) // timedelta(microseconds=1)
+    seconds, rest = divmod(microseconds, 10**6)
+    fraction = f".{rest:06d}".rstrip("0") if rest else ""
+    sign = "-" if value < timedelta(0) else ""
+    return f"{sign}{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}{fraction}"
+
+
+def print_lines(*lines: str) -> None:
+    """Print lines for people on stdout, each as one line whatever names it holds."""
+    for line in lines:
+        print(for_terminal(line), flush=True)
+
+
 def print_json(value: Any, stream: TextIO | None = None) -> None:
     """Print `value` as indented JSON with a newline at the end."""
     stream = stream or sys.stdout
-    json.dump(to_jsonable(value), stream, indent=2, ensure_ascii=False)
+    stream.write(for_json(json.dumps(to_jsonable(value), indent=2, ensure_ascii=False, default=str)))
     stream.write("\n")
 
 
 def cell_text(value: Any) -> str:
-    """One cell of a table for people: six significant digits, ``<N bytes>`` for blobs, empty for NULL."""
+    """One cell of a table for people: numbers whole up to 15 digits, ``<N bytes>`` for blobs, empty for NULL."""
     if value is None:
         return ""
-    if isinstance(value, bytes):
+    if isinstance(value, bytes | bytearray | memoryview):
         return f"<{len(value)} bytes>"
-    value = to_jsonable(value)
-    if value is None:
-        return "nan"
-    if isinstance(value, float):
-        return f"{value:.6g}"
-    return str(value).replace("\n", " ")
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, float | Decimal):
+        return number(value)
+    return for_terminal(to_jsonable(value))
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], stream: TextIO | None = None) -> None:
     """Print rows under their column names, numbers to the right. Nothing is cut, whatever the terminal's width."""
     stream = stream or sys.stdout
     rows = [tuple(row) for row in rows]
+    heads = [for_terminal(name) for name in columns]
     cells = [[cell_text(value) for value in row] for row in rows]
-    widths = [max([len(name), *(len(row[i]) for row in cells)]) for i, name in enumerate(columns)]
-    right = [bool(rows) and all(_is_number(row[i]) for row in rows) for i in range(len(columns))]
-    lines = [list(columns), ["-" * width for width in widths], *cells]
+    widths = [max([width(name), *(width(row[i]) for row in cells)]) for i, name in enumerate(heads)]
+    right = [bool(rows) and all(_is_number(row[i]) for row in rows) for i in range(len(heads))]
+    lines = [heads, ["-" * columns_wide for columns_wide in widths], *cells]
     for line in lines:
-        padded = (text.rjust(w) if r else text.ljust(w) for text, w, r in zip(line, widths, right, strict=True))
+        padded = (_pad(text, w, r) for text, w, r in zip(line, widths, right, strict=True))
         stream.write("  ".join(padded).rstrip() + "\n")
+
+
+def _pad(text: str, wide: int, right: bool) -> str:
+    space = " " * (wide - width(text))
+    return space + text if right else text + space
 
 
 def _is_number(value: Any) -> bool:
@@ -72,20 +108,53 @@ def _is_number(value: Any) -> bool:
 
 
 def print_csv(columns: Sequence[str], rows: Iterable[Sequence[Any]], stream: TextIO | None = None) -> None:
-    """Print CSV with a header: full precision, NULL empty, blobs as hex, NaN as ``nan``."""
-    writer = csv.writer(stream or sys.stdout, lineterminator="\n")
-    writer.writerow(columns)
+    """Print CSV with a header: full precision, NULL empty, blobs as hex, NaN as ``nan``.
+
+    Text is as it is stored; only on a terminal, which would obey control characters, they are escaped.
+    """
+    stream = stream or sys.stdout
+    writer = csv.writer(stream, lineterminator="\n")
+    shown = stream.isatty()
+    writer.writerow([for_terminal(name) for name in columns] if shown else columns)
     for row in rows:
-        writer.writerow([value if isinstance(value, float) else to_jsonable(value) for value in row])
+        values = [_csv_value(value) for value in row]
+        writer.writerow(
+            [for_terminal(value) if isinstance(value, str) else value for value in values] if shown else values
+        )
+
+
+def _csv_value(value: Any) -> Any:
+    if isinstance(value, float):
+        return value
+    return number(value) if isinstance(value, Decimal) else to_jsonable(value)
+
+
+def distinct(columns: Sequence[str]) -> list[str]:
+    """The names of columns as keys: of equal ones the second and later are numbered, ``id``, ``id_2``, ``id_3``.
+
+    A number that another column's own name has is passed over.
+    """
+    taken, names = set(columns), []
+    seen: Counter[str] = Counter()
+    for name in columns:
+        seen[name] += 1
+        key = name
+        if seen[name] > 1:
+            while (key := f"{name}_{seen[name]}") in taken:
+                seen[name] += 1
+            taken.add(key)
+        names.append(key)
+    return names
 
 
 def print_rows(
     columns: Sequence[str], rows: Iterable[Sequence[Any]], fmt: str = "table", stream: TextIO | None = None
 ) -> None:
-    """Print rows as ``table``, ``csv`` or ``json`` (a list of objects)."""
+    """Print rows as ``table``, ``csv`` or ``json``: a list of objects, whose keys are `distinct`."""
     if fmt == "csv":
         print_csv(columns, rows, stream)
     elif fmt == "json":
-        print_json([dict(zip(columns, row, strict=True)) for row in rows], stream)
+        keys = distinct(columns)
+        print_json([dict(zip(keys, row, strict=True)) for row in rows], stream)
     else:
         print_table(columns, rows, stream)

@@ -7,6 +7,8 @@ import time
 from types import TracebackType
 from typing import Any, Self, TextIO
 
+from semdb.shown import for_terminal, measure
+
 SECONDS_BETWEEN_LINES = 5.0
 
 
@@ -23,7 +25,7 @@ class Progress:
     def __init__(
         self, label: str, unit: str = "frames", *, stream: TextIO | None = None, terminal: bool | None = None
     ) -> None:
-        self.label, self.unit = label, unit
+        self.label, self.unit = for_terminal(label), unit
         self.stream = stream or sys.stderr
         self.terminal = self.stream.isatty() if terminal is None else terminal
         self.started = self.printed = time.monotonic()
@@ -57,11 +59,11 @@ class Progress:
         now = time.monotonic()
         rate = (done - (self._before or 0)) / max(now - self.started, 1e-9)
         if self._bar is not None:
-            self._bar.update(self._task, completed=done, total=total, rate=f"{rate:.1f} {self.unit}/s")
+            self._bar.update(self._task, completed=done, total=total, rate=f"{measure(rate, 1)} {self.unit}/s")
         elif now - self.printed >= SECONDS_BETWEEN_LINES:
             self.printed = now
             left = format_duration((total - done) / rate) if rate else "?"
-            line = f"{self.label}: {done} of {total} {self.unit}, {rate:.1f}/s, {left} left"
+            line = f"{self.label}: {done} of {total} {self.unit}, {measure(rate, 1)}/s, {left} left"
             print(line, file=self.stream, flush=True)
 
 
@@ -71,11 +73,11 @@ def _rich_bar(stream: TextIO) -> Any:
     from rich.progress import Progress as RichProgress
 
     return RichProgress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),  # a name may hold [brackets]
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn("{task.fields[unit]}"),
-        TextColumn("{task.fields[rate]}"),
+        TextColumn("{task.fields[unit]}", markup=False),
+        TextColumn("{task.fields[rate]}", markup=False),
         TimeRemainingColumn(),
         console=Console(file=stream),
         transient=True,
@@ -112,5 +114,5 @@ class StagedProgress:
 
 
 def say(line: str) -> None:
-    """A line for people, on stderr."""
-    print(f"semdb: {line}", file=sys.stderr, flush=True)
+    """A line for people, on stderr; one line whatever names it holds."""
+    print(f"semdb: {for_terminal(line)}", file=sys.stderr, flush=True)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from semdb.cli.options import CameraOption, JsonFlag, Reading, reading_options
+from semdb.shown import measure, number
 
 if TYPE_CHECKING:
     from semdb.recordings import DroppedFrame, Recording
@@ -32,7 +33,7 @@ def command(
 
     Every image is decoded, so that broken ones are found.
     """
-    from semdb.cli.output import print_json
+    from semdb.cli.output import print_json, print_lines
     from semdb.recordings import open_recordings, parse_camera
 
     recordings = open_recordings(path, None if camera is None else parse_camera(camera), reading)
@@ -42,7 +43,8 @@ def command(
     if json:
         print_json([as_json(recording, quick) for recording in recordings])
         return
-    print("\n\n".join(as_text(recording, quick) for recording in recordings))
+    for position, recording in enumerate(recordings):
+        print_lines(*[""] * (position > 0), *as_lines(recording, quick))
 
 
 def decode_all(recording: Recording) -> None:
@@ -100,39 +102,42 @@ def as_json(recording: Recording, quick: bool) -> dict[str, Any]:
         "depth_registration": recording.depth_registration,
         "trajectory_length_m": recording.trajectory_length(),
         "notes": list(recording.notes),
+        "contents": list(recording.contents),
         "assumed": list(recording.assumed),
     }
 
 
-def as_text(recording: Recording, quick: bool) -> str:
+def as_lines(recording: Recording, quick: bool) -> list[str]:
     """What is printed for people."""
-    number = counts(recording)
+    found = counts(recording)
     dropped = (*recording.dropped, *recording.decode_failures)
-    triples = f"{number['triples']} with colour, depth and pose"
-    if number["triples"] != number["usable"]:
-        triples += f"; {number['with_depth']} with depth, {number['with_pose']} with a pose"
+    triples = f"{found['triples']} with colour, depth and pose"
+    if found["triples"] != found["usable"]:
+        triples += f"; {found['with_depth']} with depth, {found['with_pose']} with a pose"
     registered = f", registered to colour ({recording.depth_registration})" if recording.depth_registration else ""
     rows = [
         ("recording", f"{recording.name} ({recording.format}) in {recording.path}"),
-        ("frames", f"{number['frames']}, usable {number['usable']} ({triples})"),
+        ("frames", f"{found['frames']}, usable {found['usable']} ({triples})"),
         ("dropped", f"{len(dropped)}{' (images were not decoded: --quick)' if quick else ''}"),
         *(("", line) for line in group_dropped(dropped)),
         ("camera", describe_camera(recording.camera)),
-        ("depth scale", f"{recording.depth_scale:g} per metre{registered}"),
-        ("masks", f"{number['with_masks']} frames" if number["with_masks"] else "none"),
-        ("trajectory", f"{recording.trajectory_length():.2f} m"),
+        ("depth scale", f"{number(recording.depth_scale)} per metre{registered}"),
+        ("masks", f"{found['with_masks']} frames" if found["with_masks"] else "none"),
+        ("trajectory", f"{measure(recording.trajectory_length(), 2)} m"),
+        *(("holds", line) for line in recording.contents),
         *(("note", note) for note in recording.notes if note not in recording.assumed),
         *(("assumed", line) for line in recording.assumed),
     ]
-    return "\n".join(f"{label:<12} {text}" for label, text in rows)
+    return [f"{label:<12} {text}" for label, text in rows]
 
 
 def describe_camera(camera: Camera) -> str:
     """One line: size, intrinsics in pixels, distortion."""
-    text = f"{camera.width}x{camera.height}, fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g}"
+    intrinsics = ", ".join(f"{name} {number(getattr(camera, name))}" for name in ("fx", "fy", "cx", "cy"))
+    text = f"{camera.width}x{camera.height}, {intrinsics}"
     if camera.model == "PINHOLE":
         return f"{text}, no distortion"
-    return f"{text}, distortion {', '.join(f'{value:g}' for value in camera.distortion)}"
+    return f"{text}, distortion {', '.join(map(number, camera.distortion))}"
 
 
 def group_dropped(dropped: Iterable[DroppedFrame]) -> list[str]:

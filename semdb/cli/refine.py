@@ -23,7 +23,7 @@ def command(
 
     Nothing else depends on it: ingest, deletion and localization work without. Does only what is out of date.
     """
-    from semdb.cli.output import print_json
+    from semdb.cli.output import print_json, print_lines
     from semdb.cli.progress import StagedProgress, say
     from semdb.database.store import open_store
     from semdb.refinement.run import refine_map, steps_of
@@ -38,7 +38,7 @@ def command(
             for result in results:
                 state = "computed" if result.computed else "up to date"
                 if not json:
-                    print(f"{info.name}: {result.summary}: {result.rows} rows, {state}")
+                    print_lines(f"{info.name}: {result.summary}: {result.rows} rows, {state}")
                 if not result.current:
                     say(f"{info.name}: the map changed meanwhile, so {result.summary} is out of date: run it again")
                 done.append(

@@ -29,9 +29,12 @@ def command(
     """
     from contextlib import closing
 
-    from semdb.cli.output import print_rows
+    from semdb.cli.output import distinct, print_rows
+    from semdb.cli.progress import say
     from semdb.database.readonly import run_readonly
 
     columns, rows = run_readonly(overrides.settings(), statement)
+    if fmt is Format.JSON and distinct(columns) != list(columns):
+        say(f"columns of equal names are numbered: {', '.join(distinct(columns))}")
     with closing(rows):
         print_rows(columns, rows, fmt)

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from semdb.cli.options import JsonFlag, Overrides, settings_options
+from semdb.cli.output import print_json, print_lines, print_table
+from semdb.shown import for_shell, measure
 
 if TYPE_CHECKING:
     from semdb.database.records import FailedItem, RecordingStatus
@@ -32,7 +34,6 @@ def command(
     json: JsonFlag = False,
 ) -> None:
     """Show what is planned, stored and failed of each recording."""
-    from semdb.cli.output import print_json
     from semdb.database.store import open_store
 
     rates, settings = Rates(), overrides.settings()
@@ -84,7 +85,7 @@ def show_rates(recordings: list[RecordingStatus], rates: Rates) -> None:
         left = sum(recording.items.get(state, 0) for state in ("pending", "running"))
         if left and rate is not None:
             time_left = f", {format_duration(left / rate)} left" if rate > 0 else ""
-            print(f"{recording.map}/{recording.name}: {left} to do, {rate:.1f} keyframes/s{time_left}")
+            print_lines(f"{recording.map}/{recording.name}: {left} to do, {measure(rate, 1)} keyframes/s{time_left}")
 
 
 def show_workers(store: Store, settings: Settings, *, everybody: bool) -> None:
@@ -98,26 +99,26 @@ def show_workers(store: Store, settings: Settings, *, everybody: bool) -> None:
     busy = workers(store.engine)
     for worker in busy if everybody else ():
         late = " (its lease has run out)" if worker.seconds_left < 0 else ""
-        print(f"worker {worker.machine} process {worker.process}: {worker.items} keyframes in hand{late}")
+        print_lines(f"worker {worker.machine} process {worker.process}: {worker.items} keyframes in hand{late}")
     if "broker_url" not in settings.model_fields_set:
         return
     if waiting := unsent(store.engine):
-        print(
+        print_lines(
             f"{waiting} keyframes wait for which no message is known to be on its way: "
             "where no semdb ingest is at them, semdb ingest --resume sends them"
         )
     try:
         found = import_module("semdb.workers").nodes(settings)
     except (ImportError, SemdbError) as error:  # not installed, or the broker does not answer
-        print(f"workers: {error}")
+        print_lines(f"workers: {error}")
         return
     at_work = {(worker.machine, worker.process) for worker in busy}
     for node in found:
         machine = node.name.partition("@")[2]
         idle = sum((machine, str(process)) not in at_work for process in node.processes)
-        print(f"worker {node.name}: {idle} of {len(node.processes)} processes idle")
+        print_lines(f"worker {node.name}: {idle} of {len(node.processes)} processes idle")
     if not found:
-        print("workers: none answers at the broker")
+        print_lines("workers: none answers at the broker")
 
 
 def look(store: Store, map_name: str | None) -> tuple[list[RecordingStatus], list[FailedItem]]:
@@ -161,11 +162,9 @@ def as_json(recording: RecordingStatus, failed: list[FailedItem], refinements: d
 
 def show(store: Store, recordings: list[RecordingStatus], failed: list[FailedItem]) -> None:
     """Print the table for people, and the first errors."""
-    from semdb.cli.output import print_table
-
-    print(f"database: {store.url}")
+    print_lines(f"database: {store.url}")
     if not recordings:
-        print("no recordings yet: semdb ingest PATH")
+        print_lines("no recordings yet: semdb ingest PATH")
         return
     rows = [
         (
@@ -179,20 +178,22 @@ def show(store: Store, recordings: list[RecordingStatus], failed: list[FailedIte
             r.items.get("failed", 0),
             r.objects,
             r.keypoints,
-            round(r.image_bytes / 2**20, 1),
+            float(measure(r.image_bytes / 2**20, 1)),
         )
         for r in recordings
     ]
     print_table(COLUMNS, rows)
     names = {recording.recording_id: recording.name for recording in recordings}
     for item in failed[:ERRORS_SHOWN]:
-        print(f"failed: {names[item.recording_id]} frame {item.frame_index}, attempt {item.attempts}: {item.error}")
+        print_lines(
+            f"failed: {names[item.recording_id]} frame {item.frame_index}, attempt {item.attempts}: {item.error}"
+        )
     if len(failed) > ERRORS_SHOWN:
-        print(f"and {len(failed) - ERRORS_SHOWN} more; --json lists all")
+        print_lines(f"and {len(failed) - ERRORS_SHOWN} more; --json lists all")
     shown = {recording.map_id for recording in recordings}
     for refined in store.refinements():
         if refined.map_id in shown and not refined.current:
-            print(f"map {refined.map}: what semdb refine computed ({refined.kind}) is out of date")
+            print_lines(f"map {refined.map}: what semdb refine computed ({refined.kind}) is out of date")
 
 
 @settings_options(models=False)
@@ -211,17 +212,15 @@ def retry(overrides: Overrides, map_name: MapName = None) -> None:
             number = requeue_failed(store.engine, recording.recording_id)
             total += number
             if number:
-                print(f"{recording.map}/{recording.name}: {number} put back; run: {ingest_again(recording)}")
+                print_lines(f"{recording.map}/{recording.name}: {number} put back; run: {ingest_again(recording)}")
     if total:
-        print("or, where workers do it: semdb ingest --resume")
+        print_lines("or, where workers do it: semdb ingest --resume")
     else:
-        print("nothing has failed")
+        print_lines("nothing has failed")
 
 
 def ingest_again(recording: RecordingStatus) -> str:
     """The command that goes on with a recording: under its own name, in its own map, read as it was."""
-    import shlex
-
     from semdb.recordings.options import option_of
     from semdb.recordings.source import parse_source
 
@@ -230,4 +229,4 @@ def ingest_again(recording: RecordingStatus) -> str:
     said = [] if source.camera is None else ["--camera", source.camera]
     for name, value in source.options.given().items():
         said += [option_of(name), value]
-    return shlex.join([*words, *said])
+    return for_shell([*words, *said])

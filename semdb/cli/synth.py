@@ -43,6 +43,7 @@ def command(
 
     Colour, exact depth, poses and object masks along a smooth walk, in the TUM layout.
     """
+    from semdb.cli.output import print_lines
     from semdb.cli.progress import Progress
     from semdb.recordings.synthetic import SyntheticOptions, write_synthetic_recording
     from semdb.recordings.synthetic.coco import write_synthetic_coco
@@ -66,13 +67,13 @@ def command(
     if coco:
         with Progress("rendering", unit="images") as progress:
             write_synthetic_coco(directory, options, rooms, split, progress.update)
-        print(f"wrote {rooms * frames} images of {rooms} rooms to {directory / split}")
+        print_lines(f"wrote {rooms * frames} images of {rooms} rooms to {directory / split}")
         return
     if rooms > 1:
         with Progress("rendering") as progress:
             folders = write_synthetic_building(directory, options, rooms, progress.update)
-        print(f"wrote {rooms} recordings of {frames} frames to {folders[0]} and so on: one map for all of them")
+        print_lines(f"wrote {rooms} recordings of {frames} frames to {folders[0]} and so on: one map for all of them")
         return
     with Progress("rendering") as progress:
         write_synthetic_recording(directory, options, progress.update)
-    print(f"wrote {frames} frames of {width}x{height} to {directory}")
+    print_lines(f"wrote {frames} frames of {width}x{height} to {directory}")

@@ -9,6 +9,7 @@ from typing import Annotated, TypeVar
 import typer
 
 from semdb.cli.options import load_settings
+from semdb.cli.output import print_lines
 from semdb.errors import UsageError
 
 _Number = TypeVar("_Number", int, float)
@@ -85,7 +86,7 @@ def train_detector(
             say(f"{output / CHECKPOINT} is kept: the same command with --resume goes on from it")
         raise
     last = f", loss {sum(done.losses[-20:]) / len(done.losses[-20:]):.3f}" if done.losses else ""
-    print(f"{done.steps} steps{last}; curves in {done.curves}; use the detector as torchvision:{done.checkpoint}")
+    print_lines(f"{done.steps} steps{last}; curves in {done.curves}; use the detector as torchvision:{done.checkpoint}")
 
 
 def classes_of(coco: Path, split: str, text: str) -> tuple[str, ...] | None:

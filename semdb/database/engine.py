@@ -175,7 +175,7 @@ def check_packet(connection: Connection, size: int, what: str) -> None:
     limit = connection.info.get("max_allowed_packet")
     if limit is not None and size > limit:
         raise DatabaseError(
-            f"{what} needs a statement of {size / 2**20:.1f} MiB, and the server takes {limit / 2**20:.1f} MiB: "
+            f"{what} needs a statement of {size} bytes, and the server takes {limit}: "
             f"raise max_allowed_packet on the server (SET GLOBAL max_allowed_packet = {_next_power(size)})"
         )
 

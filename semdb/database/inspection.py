@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from sqlalchemy import Connection, Engine, text
 
 from semdb.database import retry
+from semdb.shown import number
 
 OLDEST = {"MariaDB": (10, 11), "MySQL": (8, 0)}
 LEAST_PACKET = 16 * 2**20
@@ -87,7 +88,7 @@ def judge(facts: ServerFacts) -> Iterator[Finding]:
     yield _version(facts)
     packet = int(facts.variables.get("max_allowed_packet", "0"))
     advice = f"; SET GLOBAL max_allowed_packet = {4 * LEAST_PACKET}, and the same in the server's configuration"
-    yield _finding(packet >= LEAST_PACKET, "packet size", f"max_allowed_packet {packet / 2**20:g} MiB", advice)
+    yield _finding(packet >= LEAST_PACKET, "packet size", f"max_allowed_packet {number(packet / 2**20)} MiB", advice)
     isolation = facts.variables.get("transaction_isolation") or facts.variables.get("tx_isolation", "?")
     yield _finding(
         isolation == "REPEATABLE-READ",
@@ -107,7 +108,7 @@ def judge(facts: ServerFacts) -> Iterator[Finding]:
         yield Finding("problem", "read_only", "the server takes no writes; give the URL of the one that does")
     buffer = int(facts.variables.get("innodb_buffer_pool_size", "0"))
     if 0 < buffer < LEAST_BUFFER:
-        size = f"innodb_buffer_pool_size {buffer / 2**20:g} MiB"
+        size = f"innodb_buffer_pool_size {number(buffer / 2**20)} MiB"
         yield Finding("info", "buffer pool", f"{size}; a quarter of the server's memory or more makes queries faster")
     if facts.cluster_size:
         state = "info" if facts.cluster_size < 3 else "ok"

@@ -22,6 +22,7 @@ from semdb.database import retry
 from semdb.database.engine import make_engine, parse_url, safe_url, sqlite_path
 from semdb.errors import DatabaseError, SchemaError, UsageError
 from semdb.settings import Settings
+from semdb.shown import number
 
 Row = tuple[Any, ...]
 FETCH = 500
@@ -36,9 +37,9 @@ _DENIED_FUNCTIONS = {"load_extension", "fts3_tokenizer"}
 def run_readonly(settings: Settings, sql: str) -> tuple[tuple[str, ...], Generator[Row, None, None]]:
     """The column names and the rows of one read-only statement; close the iterator to end it early.
 
-    Whole decimals of a server (its sums) come as int, others as float, as on SQLite. Raises UsageError when it is
-    no SELECT or the account is not set, DatabaseError when the database refuses it, its account may do more than
-    read, or the time limit of `sql_time_limit_s` is over (also while rows are fetched).
+    Decimals of a server (its sums) come as int where they are whole, as float where one holds them, as on SQLite.
+    Raises UsageError when it is no SELECT or the account is not set, DatabaseError when the database refuses it, its
+    account may do more than read, or the time limit of `sql_time_limit_s` is over (also while rows are fetched).
     """
     _check_statement(sql)
     url = parse_url(settings.database_url)
@@ -94,7 +95,7 @@ def _authorize(action: int, first: str | None, second: str | None, *_: str | Non
 
 def _too_slow(settings: Settings) -> DatabaseError:
     return DatabaseError(
-        f"the statement took longer than {settings.sql_time_limit_s:g} s and was ended: "
+        f"the statement took longer than {number(settings.sql_time_limit_s)} s and was ended: "
         "narrow it, or raise SEMDB_SQL_TIME_LIMIT_S"
     )
 
@@ -181,6 +182,9 @@ def excess_rights(grant: str) -> list[str]:
 
 
 def _plain(value: Any) -> Any:
-    if isinstance(value, Decimal):
-        return int(value) if value == value.to_integral_value() else float(value)
-    return value
+    """A decimal as int or float where that is the same number; else as it is, with all its digits."""
+    if not isinstance(value, Decimal):
+        return value
+    if value == value.to_integral_value():
+        return int(value)
+    return float(value) if Decimal(repr(float(value))) == value else value

@@ -16,8 +16,9 @@ from semdb.evaluation.calibration import (
     reliability_bins,
 )
 from semdb.evaluation.metrics import EvaluationResult
-from semdb.evaluation.plots import SERIES, style_axes
+from semdb.evaluation.plots import LABEL_CHARACTERS, SERIES, style_axes
 from semdb.pictures.drawing import FAINT, INK
+from semdb.shown import for_legend
 from semdb.types import BoolArray, FloatArray
 
 INSIDE = 3  # series whose names have room inside the axes
@@ -64,11 +65,11 @@ def confidence_plot(series: Sequence[tuple[str, FloatArray, BoolArray]]) -> Figu
     right.plot([0, 1], [0, 1], color=FAINT, lw=1.0, ls=(0, (4, 3)), zorder=1)
     lowest = 1.0
     for i, (name, confidence, correct) in enumerate(series):
-        colour = SERIES[i % len(SERIES)]
+        colour, shown = SERIES[i % len(SERIES)], for_legend(name, LABEL_CHARACTERS)
         figures = confidence_figures(confidence, correct)
         curve = precision_recall(confidence, correct)
         if curve is not None:
-            label = f"{name}: AUROC {_number(figures['auroc'])}"
+            label = f"{shown}: AUROC {_number(figures['auroc'])}"
             left.plot(curve.recall, curve.precision, color=colour, lw=2.0, label=label, drawstyle="steps-post")
             lowest = min(lowest, float(curve.precision.min()))
         bins = reliability_bins(confidence, correct)
@@ -76,7 +77,7 @@ def confidence_plot(series: Sequence[tuple[str, FloatArray, BoolArray]]) -> Figu
         right.plot(bins.confidence[filled], bins.accuracy[filled], color=colour, lw=1.2, zorder=2)
         right.scatter(
             bins.confidence[filled], bins.accuracy[filled], s=20 + 260 * bins.count[filled] / bins.count.sum(),
-            color=colour, zorder=3, label=f"{name}: calibration error {_number(figures['ece'])}",
+            color=colour, zorder=3, label=f"{shown}: calibration error {_number(figures['ece'])}",
         )  # fmt: skip
     left.set_xlim(0, 1.02)
     left.set_ylim(max(0.0, lowest - 0.05), 1.01)

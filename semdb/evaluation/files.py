@@ -116,7 +116,7 @@ def write_queries_csv(path: Path, results: Sequence[EvaluationResult]) -> None:
     Raises UsageError where `path` cannot be written.
     """
     try:
-        with path.open("w", newline="", encoding="utf-8") as file:
+        with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file:
             writer = csv.DictWriter(file, CSV_COLUMNS, extrasaction="ignore", lineterminator="\n")
             writer.writeheader()
             writer.writerows(row for result in results for row in _csv_rows(result))

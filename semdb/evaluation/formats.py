@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from semdb.shown import measure
+
 NOTHING = "-"
 
 
 def percent(share: float | None) -> str:
     """0.5 becomes ``50.0 %``."""
-    return NOTHING if share is None else f"{100 * share:.1f} %"
+    return NOTHING if share is None else f"{measure(100 * share, 1, unless=(0.0, 100.0))} %"
 
 
 def errors(metres: float | None, degrees: float | None) -> str:

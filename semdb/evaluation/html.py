@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
-from html import escape
 
 from semdb.evaluation.comparisons import Grid
+from semdb.shown import for_html
 
 STYLE = """
 :root { --ink: #1b2430; --faint: #66727f; --line: #e3e7ec; --soft: #f5f7fa; --accent: #0072b2; }
@@ -44,23 +44,23 @@ dd { margin: 0; overflow-wrap: anywhere; }
 
 def page(title: str, lead: str, sections: Sequence[tuple[str, str, str]]) -> str:
     """A whole page. `sections` are (identifier, heading, HTML); headings are listed at the top."""
-    links = "".join(f'<a href="#{name}">{escape(heading)}</a>' for name, heading, _ in sections)
-    body = "\n".join(f'<h2 id="{name}">{escape(heading)}</h2>\n{content}' for name, heading, content in sections)
+    links = "".join(f'<a href="#{name}">{for_html(heading)}</a>' for name, heading, _ in sections)
+    body = "\n".join(f'<h2 id="{name}">{for_html(heading)}</h2>\n{content}' for name, heading, content in sections)
     return (
-        f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{escape(title)}</title>\n'
+        f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{for_html(title)}</title>\n'
         f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<style>{STYLE}</style>\n'
-        f"</head>\n<body>\n<h1>{escape(title)}</h1>\n{lead}\n<nav>{links}</nav>\n{body}\n</body>\n</html>\n"
+        f"</head>\n<body>\n<h1>{for_html(title)}</h1>\n{lead}\n<nav>{links}</nav>\n{body}\n</body>\n</html>\n"
     )
 
 
 def note(text: str) -> str:
     """A paragraph of explanation."""
-    return f'<p class="note">{escape(text)}</p>' if text else ""
+    return f'<p class="note">{for_html(text)}</p>' if text else ""
 
 
 def grid_html(grid: Grid, *, heading: bool = True) -> str:
     """A table with its heading and note."""
-    head = f"<h3>{escape(grid.title)}</h3>\n" if heading and grid.title else ""
+    head = f"<h3>{for_html(grid.title)}</h3>\n" if heading and grid.title else ""
     return head + note(grid.note) + table(grid.headers, grid.rows, grid.text_columns, grid.ours)
 
 
@@ -71,7 +71,7 @@ def table(
 
     def line(cells: Sequence[str], tag: str, mark: str = "") -> str:
         marked = (
-            f'<{tag} class="text">{escape(cell)}</{tag}>' if i < text_columns else f"<{tag}>{escape(cell)}</{tag}>"
+            f'<{tag} class="text">{for_html(cell)}</{tag}>' if i < text_columns else f"<{tag}>{for_html(cell)}</{tag}>"
             for i, cell in enumerate(cells)
         )
         return f"<tr{mark}>" + "".join(marked) + "</tr>"
@@ -83,24 +83,26 @@ def table(
 def image(data: bytes, alt: str, kind: str = "png") -> str:
     """An image inside the page."""
     text = base64.b64encode(data).decode()
-    return f'<img alt="{escape(alt, quote=True)}" src="data:image/{kind};base64,{text}">'
+    return f'<img alt="{for_html(alt)}" src="data:image/{kind};base64,{text}">'
 
 
 def cards(entries: Sequence[tuple[str, str]]) -> str:
     """Figures that stand out: (figure, what it is)."""
     inner = "".join(
-        f'<div class="card"><b>{escape(value)}</b><span>{escape(what)}</span></div>' for value, what in entries
+        f'<div class="card"><b>{for_html(value)}</b><span>{for_html(what)}</span></div>' for value, what in entries
     )
     return f'<div class="cards">{inner}</div>'
 
 
 def definitions(entries: Sequence[tuple[str, str]]) -> str:
     """Names and values."""
-    inner = "".join(f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in entries)
+    inner = "".join(f"<dt>{for_html(name)}</dt><dd>{for_html(value)}</dd>" for name, value in entries)
     return f"<dl>{inner}</dl>"
 
 
 def folded(summary: str, small: str, content: str, *, is_open: bool = False) -> str:
     """A part that opens at a click; `small` stands behind its heading."""
     mark = " open" if is_open else ""
-    return f"<details{mark}><summary>{escape(summary)}<small>{escape(small)}</small></summary>\n{content}\n</details>"
+    return (
+        f"<details{mark}><summary>{for_html(summary)}<small>{for_html(small)}</small></summary>\n{content}\n</details>"
+    )

@@ -18,6 +18,7 @@ from semdb.evaluation.metrics import FALSE_TRANSLATION_M, TIMING_STAGES, Evaluat
 from semdb.evaluation.published import PAPER_ROTATION, PAPER_TRANSLATION
 from semdb.pictures.drawing import FAINT, INK, VERDICT_COLOURS
 from semdb.pictures.top_view import horizontal_axes
+from semdb.shown import for_legend, for_plot
 from semdb.types import FloatArray, Verdict
 
 TRANSLATION_RANGE_M = 0.5
@@ -26,6 +27,8 @@ ROTATION_RANGE_DEG = 10.0
 SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 LINES = ("-", "--", ":", "-.")  # for the colours' second to fourth time
 LEGEND_CHARACTERS = 150  # side by side below a figure
+LABEL_CHARACTERS = 70
+TITLE_CHARACTERS = 110
 STAGE_COLOURS = ("#c9d0d8", "#0072B2", "#56B4E9", "#009E73", "#F0E442", "#E69F00", "#D55E00", "#CC79A7")
 GRID = "#e3e7ec"
 DPI = 110
@@ -64,7 +67,8 @@ def cumulative_plot(results: Sequence[EvaluationResult]) -> Figure:
     Shares are of all queries: one that is not localized is within nothing. The paper's own levels are marked. Below,
     the same up to 0.05 m and 2.5 degrees, where methods differ.
     """
-    columns = LEGEND_CHARACTERS // (max((len(name) for name in series_names(results)), default=0) + 8)
+    longest = max((len(for_legend(name, LABEL_CHARACTERS)) for name in series_names(results)), default=0)
+    columns = LEGEND_CHARACTERS // (longest + 8)
     columns = min(max(columns, 1), 4)
     figure = Figure(figsize=(12.5, 9.4 + 0.24 * math.ceil(len(results) / columns)), layout="constrained")
     panels = figure.subplots(2, 2)
@@ -97,7 +101,8 @@ def _curves(axes: Axes, results: Sequence[EvaluationResult], field: str, reach: 
         errors = [getattr(query, field) for query in result.per_query if query.is_localized]
         shares = cumulative_shares(errors, result.queries, x)
         style = LINES[i // len(SERIES) % len(LINES)]
-        axes.plot(x, shares, style, color=SERIES[i % len(SERIES)], lw=2.0, label=name, drawstyle="steps-post")
+        label = for_legend(name, LABEL_CHARACTERS)
+        axes.plot(x, shares, style, color=SERIES[i % len(SERIES)], lw=2.0, label=label, drawstyle="steps-post")
     axes.set_xlim(0, reach)
     axes.set_ylim(0, 1.02)
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
@@ -127,16 +132,17 @@ def timing_plot(results: Sequence[EvaluationResult]) -> Figure | None:
     axes = figure.subplots()
     style_axes(axes)
     axes.grid(visible=False, axis="y")
-    names = series_names(known)
+    rows = np.arange(len(known))  # not the names themselves, of which equal ones would share a bar
+    axes.set_yticks(rows, labels=[for_plot(name, LABEL_CHARACTERS) for name in series_names(known)])
     left = np.zeros(len(known))
     for colour, stage in zip(STAGE_COLOURS, stages, strict=True):
         widths = np.array([result.timing_ms.get(stage, {}).get("p50") or 0.0 for result in known])
         if widths.any():
-            axes.barh(names, widths, left=left, color=colour, height=0.66, label=stage, zorder=3)
+            axes.barh(rows, widths, left=left, color=colour, height=0.66, label=stage, zorder=3)
             left += widths
     total = np.array([result.timing_ms["total"]["p50"] or 0.0 for result in known])
     rest = np.maximum(total - left, 0.0)
-    axes.barh(names, rest, left=left, color=GRID, height=0.66, label="other", zorder=3)
+    axes.barh(rows, rest, left=left, color=GRID, height=0.66, label="other", zorder=3)
     for y, (drawn, value) in enumerate(zip(left + rest, total, strict=True)):
         axes.text(drawn, y, f"  {value:.0f} ms", va="center", color=INK, fontsize=10)
     axes.invert_yaxis()
@@ -179,7 +185,7 @@ def trajectory_plot(result: EvaluationResult) -> Figure | None:
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("metres along the longest way")
     axes.set_ylabel("metres across")
-    axes.set_title(_heading(result), loc="left", fontsize=12, color=INK)
+    axes.set_title(for_plot(_heading(result), TITLE_CHARACTERS), loc="left", fontsize=12, color=INK)
     if axes.get_legend_handles_labels()[0]:
         axes.legend(frameon=False, labelcolor=INK)
     return figure
@@ -219,7 +225,7 @@ def inlier_plot(result: EvaluationResult) -> Figure:
     axes.yaxis.set_major_formatter("{x:g}")
     axes.set_xlabel("inliers")
     axes.set_ylabel("position error (m)")
-    axes.set_title(_heading(result), loc="left", fontsize=12, color=INK)
+    axes.set_title(for_plot(_heading(result), TITLE_CHARACTERS), loc="left", fontsize=12, color=INK)
     if result.per_query:
         axes.legend(frameon=False, labelcolor=INK, loc="lower left")
     return figure

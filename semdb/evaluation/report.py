@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from html import escape
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -31,6 +30,7 @@ from semdb.evaluation.tables import (
     truth_grids,
 )
 from semdb.evaluation.worst import worst_queries
+from semdb.shown import for_html, measure
 
 WORST_HEADERS = (
     "frame",
@@ -97,7 +97,7 @@ def _lead(results: Sequence[EvaluationResult], failures: Mapping[str, str]) -> s
     protocols = ", ".join(dict.fromkeys(result.protocol for result in results))
     lead = html.note(f"Protocol {protocols}: {', '.join(recordings)}. Methods: {', '.join(methods)}.")
     for name, why in failures.items():
-        lead += f'<div class="problem"><b>{escape(name)}</b> was not evaluated: {escape(why)}</div>'
+        lead += f'<div class="problem"><b>{for_html(name)}</b> was not evaluated: {for_html(why)}</div>'
     shown = [result for result in results if result.method == SEMDB and result.truth == "given"] or list(results)
     entries = []
     for result in shown[:4]:
@@ -118,7 +118,7 @@ def _summary(results: Sequence[EvaluationResult]) -> str:
     ]
     for recording in dict.fromkeys(result.recording for result in results):
         chosen = [result for result in results if result.recording == recording]
-        parts.append(f"<h3>{escape(recording)}</h3>")
+        parts.append(f"<h3>{for_html(recording)}</h3>")
         parts.append(html.table(HEADERS[1:], [result_row(result)[1:] for result in chosen], text_columns=1))
     means = average_grid(averages(results))
     if means.rows:
@@ -153,7 +153,7 @@ def _curves(directory: Path, results: Sequence[EvaluationResult]) -> str:
     ]
     for number, recording in enumerate(dict.fromkeys(result.recording for result in results), start=1):
         chosen = [result for result in results if result.recording == recording]
-        parts.append(f"<h3>{escape(recording)}</h3>")
+        parts.append(f"<h3>{for_html(recording)}</h3>")
         parts.append(_figure(directory / f"errors-{number}.png", cumulative_plot(chosen), f"errors on {recording}"))
     return "\n".join(parts)
 
@@ -218,7 +218,7 @@ def _confidence(directory: Path, results: Sequence[EvaluationResult]) -> str:
         series = [(name, *answers(result)) for name, result in zip(series_names(chosen), chosen, strict=True)]
         counts = "; ".join(f"{name}: {int((~right).sum())} wrong of {len(right)}" for name, _, right in series)
         picture = _figure(directory / f"confidence-{number}.png", confidence_plot(series), f"confidence on {recording}")
-        parts += [f"<h3>{escape(recording)}</h3>", html.note(f"{counts}."), picture]
+        parts += [f"<h3>{for_html(recording)}</h3>", html.note(f"{counts}."), picture]
     return "\n".join(parts)
 
 
@@ -249,7 +249,7 @@ def _details(directory: Path, result: EvaluationResult, number: int) -> str:
 
 
 def _caption(query: QueryResult, usual: float | None) -> str:
-    return f"<b>{escape(query.frame)}</b>: {escape(explain(query, usual))}. {escape(query.reason)}"
+    return f"<b>{for_html(query.frame)}</b>: {for_html(explain(query, usual))}. {for_html(query.reason)}"
 
 
 def _worst_table(queries: Sequence[QueryResult], usual: float | None) -> str:
@@ -257,15 +257,17 @@ def _worst_table(queries: Sequence[QueryResult], usual: float | None) -> str:
     for query in queries:
         word = "false" if query.is_false else str(query.verdict)
         cells = [
-            f'<td class="text">{escape(query.frame)}</td>',
+            f'<td class="text">{for_html(query.frame)}</td>',
             f'<td class="text {word}">{query.verdict}{" (false)" if query.is_false else ""}</td>',
-            *(f"<td>{escape(cell)}</td>" for cell in _numbers(query)),
-            f'<td class="text">{escape(query.stage)}</td>',
-            f'<td class="prose">{escape(explain(query, usual))}. {escape(query.reason)}</td>',
+            *(f"<td>{for_html(cell)}</td>" for cell in _numbers(query)),
+            f'<td class="text">{for_html(query.stage)}</td>',
+            f'<td class="prose">{for_html(explain(query, usual))}. {for_html(query.reason)}</td>',
         ]
         rows.append("<tr>" + "".join(cells) + "</tr>")
     heads = "".join(
-        f'<th class="text">{escape(name)}</th>' if name in ("frame", "verdict", "stage", "why") else f"<th>{name}</th>"
+        f'<th class="text">{for_html(name)}</th>'
+        if name in ("frame", "verdict", "stage", "why")
+        else f"<th>{name}</th>"
         for name in WORST_HEADERS
     )
     return f'<div class="wide"><table><tr>{heads}</tr>{"".join(rows)}</table></div>'
@@ -277,7 +279,7 @@ def _numbers(query: QueryResult) -> tuple[str, ...]:
         NOTHING if query.rotation_deg is None else f"{query.rotation_deg:.2f}",
         NOTHING if query.candidate is None else str(query.candidate),
         str(query.inliers),
-        NOTHING if query.confidence is None else f"{query.confidence:.2f}",
+        NOTHING if query.confidence is None else measure(query.confidence, 2, unless=(0.0, 1.0)),
     )
 
 

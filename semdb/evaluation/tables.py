@@ -7,12 +7,14 @@ from collections.abc import Sequence
 from rich.box import SIMPLE_HEAD
 from rich.console import Group, RenderableType
 from rich.table import Table
+from rich.text import Text
 
 from semdb.evaluation.averages import Average, averages
 from semdb.evaluation.comparisons import Grid, paper_rows_evaluated
 from semdb.evaluation.formats import NOTHING, errors, percent, whole
 from semdb.evaluation.methods import ABLATION, place_of
 from semdb.evaluation.metrics import EvaluationResult
+from semdb.shown import for_markdown, for_terminal, number, width
 
 HEADERS = (
     "recording",
@@ -53,7 +55,7 @@ def result_row(result: EvaluationResult) -> tuple[str, ...]:
         percent(result.recall["0.3m"]),
         percent(result.recall["2.5deg"]),
         percent(result.ranked_share),
-        NOTHING if result.keyframes_matched is None else f"{result.keyframes_matched:g}",
+        NOTHING if result.keyframes_matched is None else number(result.keyframes_matched),
         f"{whole(total.get('p50'))} / {whole(total.get('p95'))}",
     )
 
@@ -69,13 +71,14 @@ def results_table(results: Sequence[EvaluationResult], title: str | None = None)
                 for recording in recordings
             )
         )
-    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, header_style="bold")
+    table = Table(title=_text(title) if title else None, title_justify="left", box=SIMPLE_HEAD, header_style="bold")
     table.add_column("")
     for result in results:
-        table.add_column(f"{result.recording}\n{name_of(result)}", justify="right", overflow="fold")
+        title_of = Text(f"{for_terminal(result.recording)}\n{for_terminal(name_of(result))}")
+        table.add_column(title_of, justify="right", overflow="fold")
     rows = [(*result_row(result)[TEXT_COLUMNS:], _stages(result)) for result in results]
     for name, *cells in zip((*HEADERS[TEXT_COLUMNS:], "answered by stage"), *rows, strict=True):
-        table.add_row(name, *cells)
+        table.add_row(name, *map(_text, cells))
     return table
 
 
@@ -249,7 +252,7 @@ def _ablation_cells(result: EvaluationResult) -> tuple[str, ...]:
         errors(result.mean_translation_m, result.mean_rotation_deg),
         percent(result.recall["5cm_5deg"]),
         percent(result.ranked_share),
-        NOTHING if result.keyframes_matched is None else f"{result.keyframes_matched:g}",
+        NOTHING if result.keyframes_matched is None else number(result.keyframes_matched),
         " / ".join(firsts),
     )
 
@@ -257,7 +260,7 @@ def _ablation_cells(result: EvaluationResult) -> tuple[str, ...]:
 def rich_table(grid: Grid) -> Table:
     """A grid for the terminal."""
     table = _rich(grid.headers, grid.rows, grid.title)
-    table.caption = grid.note or None
+    table.caption = _text(grid.note) if grid.note else None
     table.caption_justify = "left"
     return table
 
@@ -268,23 +271,36 @@ def grid_markdown(grid: Grid) -> str:
 
 
 def _rich(headers: Sequence[str], rows: Sequence[Sequence[str]], title: str | None) -> Table:
-    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, header_style="bold", padding=(0, 1, 0, 0))
+    table = Table(
+        title=_text(title) if title else None,
+        title_justify="left",
+        box=SIMPLE_HEAD,
+        header_style="bold",
+        padding=(0, 1, 0, 0),
+    )
     for i, header in enumerate(headers):
-        table.add_column(header, justify="left" if i == 0 else "right", overflow="fold", no_wrap=i > 0)
+        table.add_column(_text(header), justify="left" if i == 0 else "right", overflow="fold", no_wrap=i > 0)
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(_text, row))
     return table
 
 
+def _text(text: str) -> Text:
+    """For rich, which reads [brackets] and :names: of a plain string as its own markup."""
+    return Text(for_terminal(text))
+
+
 def _markdown(headers: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    widths = [max(len(cell) for cell in column) for column in zip(headers, *rows, strict=True)]
+    lines = [[for_markdown(cell) for cell in cells] for cells in (headers, *rows)]
+    widths = [max(map(width, column)) for column in zip(*lines, strict=True)]
 
     def line(cells: Sequence[str]) -> str:
+        spaces = (" " * (wide - width(cell)) for cell, wide in zip(cells, widths, strict=True))
         padded = (
-            cell.replace("|", "\\|").ljust(width) if i < TEXT_COLUMNS else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(cells, widths, strict=True))
+            cell + space if i < TEXT_COLUMNS else space + cell
+            for i, (cell, space) in enumerate(zip(cells, spaces, strict=True))
         )
         return "| " + " | ".join(padded) + " |"
 
-    rule = [("-" * width) if i < TEXT_COLUMNS else "-" * (width - 1) + ":" for i, width in enumerate(widths)]
-    return "\n".join([line(headers), line(rule), *(line(row) for row in rows)]) + "\n"
+    rule = [("-" * wide) if i < TEXT_COLUMNS else "-" * (wide - 1) + ":" for i, wide in enumerate(widths)]
+    return "\n".join([line(lines[0]), line(rule), *map(line, lines[1:])]) + "\n"

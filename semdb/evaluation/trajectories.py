@@ -11,6 +11,7 @@ from semdb.evaluation.metrics import EvaluationResult, QueryResult
 from semdb.geometry import quat_wxyz_from_rotation
 from semdb.types import FloatArray
 
+LONGEST_STEM = 200  # bytes, of the 255 that file systems take
 INDEX_NOTE = "frames have no time stamps: the first column is the frame index, in seconds"
 
 
@@ -21,12 +22,13 @@ def write_trajectories(directory: Path, results: Sequence[EvaluationResult]) -> 
     no alignment is needed. Raises UsageError where `directory` cannot be written.
     """
     written: dict[Path, None] = {}
+    taken: set[str] = set()
     try:
         directory.mkdir(parents=True, exist_ok=True)
         for result in results:
             for recording in dict.fromkeys(query.recording for query in result.per_query):
                 queries = [query for query in result.per_query if query.recording == recording]
-                stem = file_stem(recording or result.recording, result)
+                stem = _free(file_stem(recording or result.recording, result), taken)
                 for path, text in (
                     (directory / f"{stem}.txt", trajectory_text(queries, estimated=True)),
                     (directory / f"{stem}-truth.txt", trajectory_text(queries, estimated=False)),
@@ -41,7 +43,18 @@ def write_trajectories(directory: Path, results: Sequence[EvaluationResult]) -> 
 def file_stem(recording: str, result: EvaluationResult) -> str:
     """A file name without ending: letters, digits, ``_ . + -``."""
     parts = [recording, result.method, str(result.keyframes)] + ["refined"] * (result.truth != "given")
-    return re.sub(r"[^\w.+-]+", "_", "-".join(parts)).strip("_.")
+    name = re.sub(r"[^\w.+-]+", "_", "-".join(parts)).strip("_.")
+    return name.encode()[-LONGEST_STEM:].decode(errors="ignore")
+
+
+def _free(stem: str, taken: set[str]) -> str:
+    """`stem`, numbered where names that differ became the same one; it is added to `taken`."""
+    name, number = stem, 1
+    while name in taken:
+        number += 1
+        name = f"{stem}-{number}"
+    taken.add(name)
+    return name
 
 
 def trajectory_text(queries: Iterable[QueryResult], *, estimated: bool) -> str:

@@ -147,8 +147,13 @@ def _schemas(connection: Connection) -> list[str]:
 
 def _in_use(connection: Connection) -> list[str]:
     """Schemas of the connections that the account may see: all its own."""
-    query = text("SELECT DISTINCT db FROM information_schema.processlist WHERE db IS NOT NULL")
-    return [str(row[0]) for row in connection.execute(query)]
+    # Rows show the statements, too. MySQL cannot convert one that holds an image, so that it is asked for bytes.
+    connection.execute(text("SET SESSION character_set_results = binary"))
+    try:
+        schemas = [row[3] for row in connection.execute(text("SHOW PROCESSLIST"))]
+    finally:
+        connection.execute(text("SET SESSION character_set_results = utf8mb4"))
+    return sorted({bytes(schema).decode(errors="replace") for schema in schemas if schema is not None})
 
 
 def _run(database_url: str, statement: str) -> None:

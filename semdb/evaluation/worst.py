@@ -17,6 +17,7 @@ from semdb.evaluation.metrics import EvaluationResult, QueryResult
 from semdb.evaluation.runs import Run
 from semdb.evaluation.tasks import Task
 from semdb.pictures.drawing import draw_localization
+from semdb.shown import measure
 from semdb.types import Detection, Float32Array, ImageArray, Localization
 
 WORST = 10
@@ -136,7 +137,7 @@ def _draw(
 def _facts(query: QueryResult, usual_sharpness: float | None) -> list[tuple[str, str]]:
     facts = [("inliers", str(query.inliers))]
     if query.confidence is not None:
-        facts.append(("confidence", f"{query.confidence:.2f}"))
+        facts.append(("confidence", measure(query.confidence, 2, unless=(0.0, 1.0))))
     if query.translation_m is not None and query.rotation_deg is not None:
         facts.append(("off the true pose", f"{100 * query.translation_m:.1f} cm  {query.rotation_deg:.2f}°"))
     facts.append(("why", explain(query, usual_sharpness)))

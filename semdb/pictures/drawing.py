@@ -21,6 +21,7 @@ from matplotlib.patches import FancyBboxPatch
 from matplotlib.text import Text
 
 from semdb.geometry import quat_wxyz_from_rotation
+from semdb.shown import for_plot, measure
 from semdb.types import Detection, Float32Array, ImageArray, IntArray, Localization, Verdict
 
 Colour = tuple[float, float, float]
@@ -50,7 +51,7 @@ def category_colours(categories: Iterable[str], known: Mapping[str, Colour] | No
     colours = dict(known or {})
     taken = {slot for slot, colour in enumerate(PALETTE) if rgb(colour) in colours.values()}
     for name in sorted(set(categories) - set(colours)):
-        first = int.from_bytes(hashlib.sha256(name.encode()).digest()[:4], "big") % len(PALETTE)
+        first = int.from_bytes(hashlib.sha256(name.encode("utf-8", "surrogatepass")).digest()[:4], "big") % len(PALETTE)
         free = (slot % len(PALETTE) for slot in range(first, first + len(PALETTE)))
         slot = next((slot for slot in free if slot not in taken), first)
         taken.add(slot)
@@ -146,9 +147,9 @@ def draw_localization(
         axes.text(*middle, "no keyframe agrees with the query", color=FAINT, fontsize=17, ha="center", va="center")
     else:
         _draw_labels(axes, right, keyframe_detections, colours)
-    axes.text(MARGIN, 26, title, color=INK, fontsize=15, weight="bold", va="center")
+    axes.text(MARGIN, 26, for_plot(title), color=INK, fontsize=15, weight="bold", va="center")
     for pane, text in ((left, query_label), (right, keyframe_label if keyframe_image is not None else "")):
-        axes.text(pane.left, HEADER - 14, text, color=FAINT, fontsize=12, va="center")
+        axes.text(pane.left, HEADER - 14, for_plot(text), color=FAINT, fontsize=12, va="center")
     _draw_caption(axes, height - FOOTER / 2, verdict, facts)
     return figure_to_image(figure)
 
@@ -168,7 +169,7 @@ def localization_facts(localization: Localization, error: tuple[float, float] | 
         facts.append(("rotation w x y z", quaternion))
     facts.append(("inliers", str(localization.inliers)))
     if np.isfinite(localization.confidence):
-        facts.append(("confidence", f"{localization.confidence:.2f}"))
+        facts.append(("confidence", measure(localization.confidence, 2, unless=(0.0, 1.0))))
     if error is not None:
         facts.append(("off the true pose", f"{100 * error[0]:.1f} cm  {error[1]:.2f}°"))
     if pose is None and localization.reason:
@@ -284,10 +285,10 @@ def _draw_labels(axes: Axes, pane: _Pane, detections: Sequence[Detection], colou
     """A plate with class and score at the top of each object, moved down until it covers no other plate."""
     taken: list[tuple[float, float, float, float]] = []
     for detection in sorted(detections, key=lambda d: -d.score):
-        text = f"{detection.category} {detection.score:.2f}"
+        text = for_plot(f"{detection.category} {detection.score:.2f}", int((pane.width - 11.0) / 8.3))
         plate_width, plate_height = 11.0 + 8.3 * len(text), 22.0
         x, y = pane.place(detection.box[:2])[0]
-        x = float(np.clip(x, pane.left, pane.left + pane.width - plate_width))
+        x = max(pane.left, min(float(x), pane.left + pane.width - plate_width))
         y = float(np.clip(y, pane.top, pane.top + pane.height - plate_height))
         while any(_overlap((x, y, x + plate_width, y + plate_height), other) for other in taken):
             y += 4.0
@@ -317,8 +318,8 @@ def _draw_caption(axes: Axes, y: float, verdict: Verdict, facts: Sequence[tuple[
     )  # fmt: skip
     x = _right_edge(chip) + 48
     for name, value in facts:
-        head = axes.text(x, y - 15, name, color=FAINT, fontsize=10.5, va="center")
-        body = axes.text(x, y + 11, value, color=INK, fontsize=14, va="center")
+        head = axes.text(x, y - 15, for_plot(name), color=FAINT, fontsize=10.5, va="center")
+        body = axes.text(x, y + 11, for_plot(value), color=INK, fontsize=14, va="center")
         room = axes.get_xlim()[1] - MARGIN - x
         _fit(body, room)
         x = max(_right_edge(head), _right_edge(body)) + 40

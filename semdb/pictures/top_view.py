@@ -15,6 +15,7 @@ from matplotlib.patches import Ellipse, Polygon
 from matplotlib.text import Text
 
 from semdb.pictures.drawing import FAINT, INK, VERDICT_COLOURS, Colour, blank_figure, category_colours, figure_to_image
+from semdb.shown import for_plot, number
 from semdb.types import FloatArray, ImageArray, Verdict
 
 KEYFRAME = "#9aa5b1"
@@ -179,7 +180,7 @@ def draw_top_view(
         _object_names(axes, sheet, axes_3d, shown, occupied)
         handles.append(_marker(INK, "objects (size: how often seen)", "o"))
     _draw_scale_bar(axes, sheet, size)
-    axes.text(24, 28, title, color=INK, fontsize=15, weight="bold", va="center")
+    axes.text(24, 28, for_plot(title), color=INK, fontsize=15, weight="bold", va="center")
     axes.legend(
         handles=handles, loc="lower left", bbox_to_anchor=(0.006, 0.006), ncols=len(handles), frameon=False,
         fontsize=12, labelcolor=INK, handletextpad=0.5, columnspacing=1.8,
@@ -269,7 +270,9 @@ def _object_names(
     taken = list(occupied)
     for item in objects:
         spot = sheet.place(axes_3d @ item.position)
-        text: Text = axes.text(0, 0, item.category, color=INK, fontsize=11, ha="center", va="center", zorder=10)
+        text: Text = axes.text(
+            0, 0, for_plot(item.category), color=INK, fontsize=11, ha="center", va="center", zorder=10
+        )
         extent = text.get_window_extent()
         half = np.array([extent.width, extent.height]) / 2 + 1
         gap = _dot_radius(item) + 3
@@ -311,4 +314,4 @@ def _draw_scale_bar(axes: Axes, sheet: _Sheet, size: tuple[int, int]) -> None:
     axes.plot([right - length, right], [y, y], color=INK, lw=2.5, solid_capstyle="butt", zorder=10)
     for x in (right - length, right):
         axes.plot([x, x], [y - 5, y + 5], color=INK, lw=1.5, zorder=10)
-    axes.text(right - length / 2, y - 15, f"{metres:g} m", color=FAINT, fontsize=12, ha="center", va="center")
+    axes.text(right - length / 2, y - 15, f"{number(metres)} m", color=FAINT, fontsize=12, ha="center", va="center")

@@ -38,6 +38,7 @@ class Draft:
     assumed_scale: str = ""  # why that scale, where nothing says it; "" where something does
     assumed: list[str] = field(default_factory=list)  # what is taken for granted, for people
     data: FrameData | None = None  # where images are no files of their own
+    contents: tuple[str, ...] = ()
 
 
 def use_camera_file(draft: Draft, camera: Camera | None, options: ReadOptions, *folders: Path) -> bool:
@@ -130,6 +131,7 @@ def _recording(draft: Draft, usable: Sequence[FrameEntry], camera: Camera) -> Re
         depth_registration=draft.depth_registration if any(entry.depth_path for entry in usable) else "",
         categories=draft.categories,
         data=draft.data,
+        contents=draft.contents,
     )
 
 

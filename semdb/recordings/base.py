@@ -109,6 +109,7 @@ class Recording:
     categories: Mapping[int, str] | None = None
     source: str = ""  # what the database keeps of where it came from; "": the folder
     data: FrameData | None = None  # where images are no files of their own
+    contents: tuple[str, ...] = ()  # what else the file holds and what is taken of it, a line each for people
     decode_failures: list[DroppedFrame] = field(default_factory=list)
     _failed: set[str] = field(default_factory=set)  # names of those
 

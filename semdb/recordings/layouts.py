@@ -6,7 +6,18 @@ from dataclasses import fields
 from pathlib import Path
 
 from semdb.errors import RecordingError, UsageError
-from semdb.recordings import icl_nuim, nice_slam, polycam, record3d, redwood, scannet, seven_scenes, stray_scanner, tum
+from semdb.recordings import (
+    icl_nuim,
+    nice_slam,
+    polycam,
+    record3d,
+    redwood,
+    ros_bag,
+    scannet,
+    seven_scenes,
+    stray_scanner,
+    tum,
+)
 from semdb.recordings.base import Layout, Recording
 from semdb.recordings.intrinsics import depth_scale_problem
 from semdb.recordings.options import ReadOptions, option_of
@@ -23,6 +34,7 @@ LAYOUTS: tuple[Layout, ...] = (
     scannet.FOLDER,
     nice_slam.LAYOUT,
     redwood.LAYOUT,
+    ros_bag.LAYOUT,
 )
 CHILDREN_LOOKED_AT = 200
 

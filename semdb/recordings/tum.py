@@ -29,6 +29,7 @@ from semdb.recordings.association import (
 from semdb.recordings.base import DroppedFrame, FrameEntry, Layout, Recording
 from semdb.recordings.cameras import TUM_DEPTH_SCALE, tum_camera
 from semdb.recordings.options import ReadOptions
+from semdb.shown import measure
 from semdb.types import Camera
 
 _LABEL = re.compile(r"[0-9]{1,9}")
@@ -173,14 +174,14 @@ def _associate(
         partner, gaps = nearest_pairs(times, np.array([file.time_ns for file in depth], dtype=np.int64))
     for (index, file), match, gap in zip(kept, partner, gaps.tolist(), strict=True):
         if depth is not None and match is None:
-            reason = f"no depth image within {LIMIT_MS:g} ms (the nearest: {gap / 1e6:.1f} ms)"
+            reason = f"no depth image within {LIMIT_MS:g} ms (the nearest: {_milliseconds(gap)} ms)"
             draft.dropped.append(DroppedFrame(file.name, reason))
             continue
         pose, turn_rate = None, None
         if trajectory is not None:
             pose, pose_gap = pose_at(trajectory, file.time_ns)
             if pose is None:
-                reason = f"no pose within {LIMIT_MS:g} ms (the nearest: {pose_gap / 1e6:.1f} ms)"
+                reason = f"no pose within {LIMIT_MS:g} ms (the nearest: {_milliseconds(pose_gap)} ms)"
                 draft.dropped.append(DroppedFrame(file.name, reason))
                 continue
             turn_rate = turn_rate_at(trajectory, file.time_ns)
@@ -196,6 +197,10 @@ def _associate(
                 turn_rate=turn_rate,
             )
         )
+
+
+def _milliseconds(gap_ns: int) -> str:
+    return measure(gap_ns / 1e6, 1, unless=(0.0, LIMIT_MS))
 
 
 LAYOUT = Layout(

@@ -256,14 +256,14 @@ def test_a_query_that_sees_nothing_finds_nothing(store: Store) -> None:
         ClassQuery((ClassTerm("cup", 10, 20),), 19, per_held=1)
 
 
-def test_scores_are_equal_to_the_last_bit_on_both_servers(tmp_path: Path, mariadb_url: str) -> None:
+def test_scores_are_equal_to_the_last_bit_on_both_servers(tmp_path: Path, server_url: str) -> None:
     rng = np.random.default_rng(3)
     queries = [
         {str(name): float(count) for name, count in zip(CATEGORIES, rng.uniform(0, 3, 6).round(2), strict=True)}
         for _ in range(20)
     ]
     answers = []
-    for url in (f"sqlite:///{tmp_path / 'a.sqlite3'}", mariadb_url):
+    for url in (f"sqlite:///{tmp_path / 'a.sqlite3'}", server_url):
         engine = make_engine(url)
         schema.upgrade(engine)
         engine.dispose()

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from semdb.cli.main import app
 from semdb.database.store import open_store
 from tests.database_samples import fill
-from tests.mariadb import TestServer
+from tests.servers import TestServer
 
 
 def run(*arguments: str, code: int = 0) -> Any:
@@ -24,14 +24,14 @@ def run(*arguments: str, code: int = 0) -> Any:
 
 
 @pytest.fixture
-def accounts(mariadb_server: TestServer, mariadb_url: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, str]]:
+def accounts(database_server: TestServer, server_url: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, str]]:
     """URLs of the accounts that `semdb init --accounts --execute` made, dropped in the end."""
     for name in [name for name in os.environ if name.startswith("SEMDB_")]:
         monkeypatch.delenv(name)
-    output = run("init", "--accounts", "--execute", "--database-url", mariadb_url).stdout
+    output = run("init", "--accounts", "--execute", "--database-url", server_url).stdout
     urls = {line.split()[0]: line.split()[-1] for line in output.splitlines()[1:]}
     yield urls
-    mariadb_server.execute(*(f"DROP USER '{make_url(url).username}'@'%'" for url in urls.values()))
+    database_server.execute(*(f"DROP USER '{make_url(url).username}'@'%'" for url in urls.values()))
 
 
 def test_each_account_does_its_work_and_no_more(accounts: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:

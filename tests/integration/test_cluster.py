@@ -16,7 +16,7 @@ from semdb.errors import DatabaseError
 from semdb.ingestion.run import IngestOptions, ingest_recordings
 from semdb.recordings.synthetic import SyntheticOptions
 from semdb.settings import Settings
-from tests import servers, services
+from tests import clusters, services
 from tests.integration.comparison import content, rows_per_table
 from tests.rooms import render
 
@@ -29,8 +29,8 @@ def settings(url: str) -> Settings:
 
 
 @pytest.fixture(scope="module")
-def cluster() -> Iterator[servers.Cluster]:
-    with servers.cluster() as made:
+def cluster() -> Iterator[clusters.Cluster]:
+    with clusters.cluster() as made:
         engine = make_engine(made.url())
         schema.upgrade(engine)
         engine.dispose()
@@ -38,7 +38,7 @@ def cluster() -> Iterator[servers.Cluster]:
 
 
 def test_concurrent_ingest_a_killed_node_and_its_return(
-    cluster: servers.Cluster, tmp_path_factory: pytest.TempPathFactory
+    cluster: clusters.Cluster, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     folder = tmp_path_factory.mktemp("cluster")
     room = render(folder / "room", SyntheticOptions(frames=FRAMES, width=96, height=72, lap_frames=90))
@@ -106,15 +106,16 @@ def test_concurrent_ingest_a_killed_node_and_its_return(
     one_node_that_is_alive_is_enough(cluster)
 
 
-def tables(cluster: servers.Cluster) -> str:
+def tables(cluster: clusters.Cluster) -> str:
     where = "table_schema = 'semdb' AND table_type = 'BASE TABLE'"
     query = f"SELECT table_name FROM information_schema.tables WHERE {where} ORDER BY table_name"
     return ", ".join(f"semdb.{name}" for (name,) in cluster.nodes[0].execute(query))
 
 
-def one_node_that_is_alive_is_enough(cluster: servers.Cluster) -> None:
+def one_node_that_is_alive_is_enough(cluster: clusters.Cluster) -> None:
     port = services.free_port()
-    url = f"mysql+pymysql://semdb_test:{servers.PASSWORD}@127.0.0.1:{port},127.0.0.1:{cluster.nodes[2].port}/semdb"
+    alive = cluster.nodes[2]
+    url = alive.url().replace("@", f"@127.0.0.1:{port},")
     with open_store(url) as store:
         assert isinstance(store.maps(), list)
-        assert store.url == f"mysql+pymysql://semdb_test:***@127.0.0.1:{port},127.0.0.1:{cluster.nodes[2].port}/semdb"
+        assert store.url == f"mysql+pymysql://semdb_test:***@127.0.0.1:{port},127.0.0.1:{alive.port}/semdb"

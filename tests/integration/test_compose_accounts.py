@@ -26,7 +26,7 @@ ROLES = ("owner", "writer", "reader")
 
 
 @pytest.fixture(scope="module")
-def urls(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
+def urls(server_kind: servers.Kind, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
     """A URL for each account, after the script of the composition has made them."""
     folder = tmp_path_factory.mktemp("compose")
     client = folder / "mysql"
@@ -36,7 +36,7 @@ def urls(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
     environment = {"PATH": f"{folder}:{os.environ['PATH']}", "OUT": str(folder), "MYSQL_ROOT_PASSWORD": "r", **given}
     script = REPOSITORY / "scripts" / "compose-accounts.sh"
     subprocess.run(["bash", str(script)], env=environment, check=True, timeout=30)
-    with servers.server() as server:
+    with servers.server(server_kind) as server:
         server.execute("DROP DATABASE semdb", *filter(None, (folder / "statements").read_text().split(";\n")))
         where = f"127.0.0.1:{server.port}/semdb"
         yield {role: f"mysql+pymysql://semdb_{role}:only4{role}@{where}" for role in ROLES}

@@ -18,7 +18,7 @@ from semdb.database import retry, schema
 from semdb.database.engine import make_engine
 from semdb.database.store import Store, open_store
 from semdb.errors import DatabaseError, UsageError
-from tests.mariadb import TestServer
+from tests.servers import TestServer
 
 
 @pytest.mark.parametrize(
@@ -56,10 +56,10 @@ def test_a_server_that_accepts_and_says_nothing(monkeypatch: pytest.MonkeyPatch)
         assert time.monotonic() - began < 30  # a limit exists, however slow the machine
 
 
-def test_a_wrong_password_and_a_wrong_schema(mariadb_server: TestServer) -> None:
+def test_a_wrong_password_and_a_wrong_schema(database_server: TestServer) -> None:
     for url in (
-        mariadb_server.admin.set(password="wrong-secret", database="mysql"),
-        mariadb_server.admin.set(database="no_such_schema"),
+        database_server.admin.set(password="wrong-secret", database="mysql"),
+        database_server.admin.set(database="no_such_schema"),
     ):
         with pytest.raises(DatabaseError, match="refuses: check user, password and schema") as caught:
             open_store(url.render_as_string(hide_password=False))
@@ -167,10 +167,10 @@ def test_a_refused_statement_is_not_repeated(store: Store) -> None:
     assert len(calls) == 1
 
 
-def test_a_deadlock_is_resolved(mariadb_url: str) -> None:
+def test_a_deadlock_is_resolved(server_url: str) -> None:
     """Two transactions lock two rows in opposite order: the server ends one, and it is run again."""
-    schema.upgrade(make_engine(mariadb_url))
-    with open_store(mariadb_url) as store:
+    schema.upgrade(make_engine(server_url))
+    with open_store(server_url) as store:
         first, second = store.ensure_map("a"), store.ensure_map("b")
         barrier = threading.Barrier(2, timeout=10)
         calls: list[int] = []
@@ -200,9 +200,9 @@ def test_a_deadlock_is_resolved(mariadb_url: str) -> None:
         assert [info.name for info in store.maps()] == ["axx", "bxx"]
 
 
-def test_a_killed_connection_is_replaced(mariadb_url: str) -> None:
-    schema.upgrade(make_engine(mariadb_url))
-    with open_store(mariadb_url) as store:
+def test_a_killed_connection_is_replaced(server_url: str) -> None:
+    schema.upgrade(make_engine(server_url))
+    with open_store(server_url) as store:
         calls: list[int] = []
 
         def work(connection: Connection) -> int:

@@ -16,7 +16,7 @@ from semdb.database.store import Store
 from semdb.settings import Settings
 from semdb.types import Localization, Verdict
 from tests.database_samples import MODELS, description, fill, plan, pose, record
-from tests.mariadb import TestServer
+from tests.servers import TestServer
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 COOKBOOK = re.findall(r"```sql\n(.*?)```", (DOCS / "sql.md").read_text(encoding="utf-8"), re.DOTALL)
@@ -61,13 +61,11 @@ def test_there_are_enough_questions() -> None:
     assert len(COOKBOOK) >= 12
 
 
-def test_every_query_of_the_cookbook_runs(store: Store, database_url: str, request: pytest.FixtureRequest) -> None:
+def test_every_query_of_the_cookbook_runs(store: Store, database_url: str, server_of_url: TestServer | None) -> None:
     _populate(store)
     settings = Settings(database_url=database_url)
-    server: TestServer | None = None
     names = {role: f"docs_{role}" for role in accounts.ROLES}
-    if store.engine.dialect.name != "sqlite":
-        server = request.getfixturevalue("mariadb_server")
+    if server_of_url is not None:
         made = accounts.plan_accounts(database_url, names=names)
         accounts.execute(database_url, made.statements)
         settings = Settings(database_url=database_url, reader_url=made.urls["reader"])
@@ -75,8 +73,8 @@ def test_every_query_of_the_cookbook_runs(store: Store, database_url: str, reque
         results = [run_readonly(settings, query) for query in COOKBOOK]
         answers = [(columns, list(rows)) for columns, rows in results]
     finally:
-        if server is not None:
-            server.execute(*(f"DROP USER '{name}'@'%'" for name in names.values()))
+        if server_of_url is not None:
+            server_of_url.execute(*(f"DROP USER '{name}'@'%'" for name in names.values()))
     for query, (_, rows) in zip(COOKBOOK, answers, strict=True):
         if "recording = 'second visit'" not in query:  # what is missing there depends on the seed
             assert rows, f"no rows: {query}"

@@ -52,10 +52,10 @@ class Writer:
 
 @pytest.mark.parametrize("during_statement", [True, False])
 @pytest.mark.parametrize("table", ["keyframes", "ingest_items", "recordings"])
-def test_no_keyframe_goes_without_a_trace(mariadb_url: str, table: str, during_statement: bool) -> None:
+def test_no_keyframe_goes_without_a_trace(server_url: str, table: str, during_statement: bool) -> None:
     """The writer begins right before rows of `table` are deleted; it ends before that, or while that statement runs."""
-    schema.upgrade(make_engine(mariadb_url))
-    with open_store(mariadb_url) as store, open_store(mariadb_url) as other:
+    schema.upgrade(make_engine(server_url))
+    with open_store(server_url) as store, open_store(server_url) as other:
         map_id, kept, ids = fill(store, name="another")  # of the same camera, which so stays
         recording_id = store.plan_recording(map_id, plan("r", [1, 2]), MODELS).recording_id
         assert other.write_keyframe(recording_id, record(1, description(1))).created  # it remembers the recording

@@ -6,15 +6,17 @@ import json
 import shutil
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from sqlalchemy import text
+from sqlalchemy import Engine, text
 
 from semdb.database.engine import make_engine
-from semdb.evaluation.workspace import drop_abandoned, new_name, this_host
+from semdb.evaluation.workspace import _in_use, drop_abandoned, new_name, this_host
 from semdb.recordings.synthetic import SyntheticOptions, write_synthetic_recording
 from tests.rooms import SMALL, semdb
 from tests.unit.onnx_files import write_constant_model
@@ -213,17 +215,17 @@ def test_colmap_and_both_truths(room: Path, tmp_path: Path) -> None:
     assert "Errors against both truths" in output
 
 
-def test_schemas_that_killed_evaluations_left_behind_are_dropped(mariadb_url: str) -> None:
+def test_schemas_that_killed_evaluations_left_behind_are_dropped(server_url: str) -> None:
     host = this_host()
     mine, foreign = f"semdb_evaluate_{host}_4194999_1700000000_abcdef", "semdb_evaluate_00000000_7_1700000000_abcdef"
     running = new_name()
     names = (mine, foreign, running)
-    engine = make_engine(mariadb_url)
+    engine = make_engine(server_url)
     try:
         with engine.connect() as connection:
             for name in names:
                 connection.execute(text(f"CREATE DATABASE {name}"))
-        lines = drop_abandoned(mariadb_url)
+        lines = drop_abandoned(server_url)
         with engine.connect() as connection:
             left = {row[0] for row in connection.execute(text("SHOW DATABASES"))}
         assert left.intersection(names) == {foreign, running}
@@ -235,3 +237,27 @@ def test_schemas_that_killed_evaluations_left_behind_are_dropped(mariadb_url: st
             for name in names:
                 connection.execute(text(f"DROP DATABASE IF EXISTS {name}"))
         engine.dispose()
+
+
+def test_who_uses_a_schema_is_seen_while_images_are_sent(server_url: str) -> None:
+    """A list of connections shows their statements, and MySQL fails to convert one that is no text."""
+    engine = make_engine(server_url)
+    image = bytes(range(255, 0, -1)) * 4
+    stored = threading.Thread(target=lambda: _store_slowly(engine, image))
+    try:
+        with engine.begin() as connection:
+            connection.execute(text("CREATE TABLE images (data LONGBLOB, slept INT)"))
+        stored.start()
+        with engine.connect() as connection:
+            time.sleep(0.3)  # it takes a second
+            assert stored.is_alive()
+            assert str(engine.url.database) in _in_use(connection)
+            assert connection.execute(text("SELECT 'text'")).scalar_one() == "text"
+    finally:
+        stored.join()
+        engine.dispose()
+
+
+def _store_slowly(engine: Engine, image: bytes) -> None:
+    with engine.begin() as connection:
+        connection.execute(text("INSERT INTO images SELECT :image, SLEEP(1)"), {"image": image})

@@ -39,13 +39,13 @@ class Big:
     map_ids: list[int]
 
 
-@pytest.fixture(scope="module", params=["sqlite", "mariadb"])
+@pytest.fixture(scope="module", params=["sqlite", "mariadb", "mysql"])
 def big(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Big]:
     with contextlib.ExitStack() as stack:
         if request.param == "sqlite":
             url = f"sqlite:///{tmp_path_factory.mktemp('big') / 'semdb.sqlite3'}"
         else:
-            url = stack.enter_context(request.getfixturevalue("mariadb_server").schema())
+            url = stack.enter_context(request.getfixturevalue(f"{request.param}_server").schema())
         engine = make_engine(url)
         schema.upgrade(engine)
         engine.dispose()

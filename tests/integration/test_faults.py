@@ -75,18 +75,18 @@ def start_ingest(room: Path, url: str) -> subprocess.Popen[str]:
     )
 
 
-def test_thirty_killed_workers(long_room: Path, undisturbed: Store, mariadb_url: str, tmp_path: Path) -> None:
+def test_thirty_killed_workers(long_room: Path, undisturbed: Store, any_server_url: str, tmp_path: Path) -> None:
     """Four processes of two workers; most kills take one of the four, some a whole worker."""
-    make_schema(mariadb_url)
+    make_schema(any_server_url)
     chance = random.Random(7)
     due = sorted(chance.sample(range(5, FRAMES - 10), KILLS))
-    with services.redis(tmp_path) as broker, open_store(mariadb_url) as store:
+    with services.redis(tmp_path) as broker, open_store(any_server_url) as store:
         where = {"SEMDB_BROKER_URL": broker.url, **SPECS}
-        queued = semdb("ingest", long_room, "--queue", "--stride", 1, "--map", "m", url=mariadb_url, **where)
+        queued = semdb("ingest", long_room, "--queue", "--stride", 1, "--map", "m", url=any_server_url, **where)
         assert queued.returncode == 0, queued.stderr
 
         def worker() -> services.Worker:
-            return services.start_worker(tmp_path, mariadb_url, broker.url, processes=2, **SPECS)
+            return services.start_worker(tmp_path, any_server_url, broker.url, processes=2, **SPECS)
 
         def reach(keyframes: int, running: list[services.Worker]) -> None:
             """Waits for so many; as a supervisor, starts workers that have ended and has what they had sent again."""
@@ -94,7 +94,7 @@ def test_thirty_killed_workers(long_room: Path, undisturbed: Store, mariadb_url:
                 for place, one in enumerate(running):
                     if one.process.poll() is not None:
                         running[place] = worker()
-                        assert semdb("ingest", "--resume", url=mariadb_url, **where).returncode == 0
+                        assert semdb("ingest", "--resume", url=any_server_url, **where).returncode == 0
                 time.sleep(0.02)
 
         kills = 0
@@ -115,8 +115,10 @@ def test_thirty_killed_workers(long_room: Path, undisturbed: Store, mariadb_url:
         assert store.failed_items() == []
 
 
-def test_the_database_server_is_killed_and_started_again(long_room: Path, some: Store) -> None:
-    with servers.server("--innodb-flush-log-at-trx-commit=1") as server:
+def test_the_database_server_is_killed_and_started_again(
+    long_room: Path, some: Store, server_kind: servers.Kind
+) -> None:
+    with servers.server(server_kind, "--innodb-flush-log-at-trx-commit=1") as server:
         make_schema(server.url())
         process = start_ingest(long_room, server.url())
         with open_store(server.url()) as store:
@@ -130,17 +132,19 @@ def test_the_database_server_is_killed_and_started_again(long_room: Path, some: 
             assert content(store) == content(some)
 
 
-def test_connections_are_cut(long_room: Path, some: Store, mariadb_url: str) -> None:
-    make_schema(mariadb_url)
+def test_connections_are_cut(long_room: Path, some: Store, server_url: str) -> None:
+    make_schema(server_url)
     done = threading.Event()
     cut: list[int] = []
 
     def cut_all() -> None:
-        engine = make_engine(mariadb_url)
+        engine = make_engine(server_url)
         own = engine.connect()
-        query = text("SELECT id FROM information_schema.processlist WHERE db = DATABASE() AND id <> CONNECTION_ID()")
+        schema, own_id = own.execute(text("SELECT DATABASE(), CONNECTION_ID()")).one()
+        own.execute(text("SET SESSION character_set_results = binary"))  # statements that are shown hold images
         while not done.wait(0.15):
-            for number in own.execute(query).scalars().all():
+            listed = own.execute(text("SHOW PROCESSLIST")).all()  # id, user, host, schema, ...
+            for number in (row[0] for row in listed if row[3] == schema.encode() and row[0] != own_id):
                 try:
                     own.execute(text(f"KILL {number}"))
                     cut.append(number)
@@ -153,42 +157,42 @@ def test_connections_are_cut(long_room: Path, some: Store, mariadb_url: str) -> 
     thread = threading.Thread(target=cut_all)
     thread.start()
     try:
-        ingest_recordings([long_room], settings(mariadb_url), IngestOptions(stride=FRAMES // SOME, map_name="m"))
+        ingest_recordings([long_room], settings(server_url), IngestOptions(stride=FRAMES // SOME, map_name="m"))
     finally:
         done.set()
         thread.join()
     assert len(cut) >= 3
-    with open_store(mariadb_url) as store:
+    with open_store(server_url) as store:
         assert content(store) == content(some)
 
 
 def test_the_broker_is_killed_and_comes_back_empty(
-    long_room: Path, some: Store, mariadb_url: str, tmp_path: Path
+    long_room: Path, some: Store, any_server_url: str, tmp_path: Path
 ) -> None:
-    make_schema(mariadb_url)
-    with services.redis(tmp_path) as broker, open_store(mariadb_url) as store:
+    make_schema(any_server_url)
+    with services.redis(tmp_path) as broker, open_store(any_server_url) as store:
         where = {"SEMDB_BROKER_URL": broker.url, **SPECS}
         arguments = ("ingest", long_room, "--queue", "--stride", FRAMES // SOME, "--map", "m")
-        assert semdb(*arguments, url=mariadb_url, **where).returncode == 0
-        with services.workers(services.start_worker(tmp_path, mariadb_url, broker.url, **SPECS)) as [worker]:
+        assert semdb(*arguments, url=any_server_url, **where).returncode == 0
+        with services.workers(services.start_worker(tmp_path, any_server_url, broker.url, **SPECS)) as [worker]:
             services.wait_until(lambda: stored(store) >= 5, "5 keyframes")
             broker.kill()
-            refused = semdb("ingest", "--resume", url=mariadb_url, **where)
+            refused = semdb("ingest", "--resume", url=any_server_url, **where)
             assert refused.returncode == 1
             assert "does not answer" in refused.stderr
             assert "semdb ingest --resume" in refused.stderr
             broker.start()
-            assert semdb("ingest", "--resume", url=mariadb_url, **where).returncode == 0
+            assert semdb("ingest", "--resume", url=any_server_url, **where).returncode == 0
             services.wait_until(lambda: is_complete(store), "all are stored")
             worker.process.terminate()
             assert worker.process.wait(30) == 0
         assert content(store) == content(some)
 
 
-def test_the_disk_of_the_database_is_full(long_room: Path, some: Store) -> None:
+def test_the_disk_of_the_database_is_full(long_room: Path, some: Store, server_kind: servers.Kind) -> None:
     space = "--innodb-data-file-path=ibdata1:12M:autoextend:max:{}M"
     how = ("--innodb-file-per-table=0",)
-    with servers.server(*how, space.format(16), install_options=(*how, space.format(16))) as server:
+    with servers.server(server_kind, *how, space.format(16), install_options=(*how, space.format(16))) as server:
         make_schema(server.url())
         with open_store(server.url()) as store:
             fill = IngestOptions(stride=1, map_name="full")
@@ -210,18 +214,19 @@ def deadlocks(url: str) -> int:
     """How many the server has found so far."""
     engine = make_engine(url)
     with engine.connect() as connection:
-        (_, number) = connection.execute(text("SHOW GLOBAL STATUS LIKE 'Innodb_deadlocks'")).one()
+        query = text("SELECT count FROM information_schema.innodb_metrics WHERE name = 'lock_deadlocks'")
+        number = int(connection.execute(query).scalar_one())
     engine.dispose()
-    return int(number)
+    return number
 
 
-def test_ingest_and_delete_of_one_recording_at_once(long_room: Path, some: Store, mariadb_url: str) -> None:
+def test_ingest_and_delete_of_one_recording_at_once(long_room: Path, some: Store, server_url: str) -> None:
     """Three writers and two that delete, until 8 deletions are done and writers and deleters have met in a deadlock.
 
     Then nothing is left, and it can be ingested.
     """
-    make_schema(mariadb_url)
-    met = deadlocks(mariadb_url)
+    make_schema(server_url)
+    met = deadlocks(server_url)
     options = IngestOptions(stride=FRAMES // SOME, map_name="m")
     end = threading.Event()
     wrong: list[BaseException] = []
@@ -241,14 +246,14 @@ def test_ingest_and_delete_of_one_recording_at_once(long_room: Path, some: Store
         return run
 
     def ingest() -> None:
-        ingest_recordings([long_room], settings(mariadb_url), options)
+        ingest_recordings([long_room], settings(server_url), options)
 
     def delete() -> None:
-        with open_store(mariadb_url) as store:
+        with open_store(server_url) as store:
             key = store.find_recording(store.find_map("m").id, "room")
             services.wait_until(lambda: end.is_set() or stored(store) >= 3, "keyframes to delete")
             deletions.append(store.delete_recording(key).keyframes)
-            if (len(deletions) >= 8 and deadlocks(mariadb_url) > met) or len(deletions) >= 60:
+            if (len(deletions) >= 8 and deadlocks(server_url) > met) or len(deletions) >= 60:
                 end.set()
 
     threads = [threading.Thread(target=repeat(work)) for work in (ingest, ingest, ingest, delete, delete)]
@@ -258,8 +263,8 @@ def test_ingest_and_delete_of_one_recording_at_once(long_room: Path, some: Store
         thread.join(120)
     assert wrong == []
     assert len(deletions) >= 8
-    assert deadlocks(mariadb_url) > met, "no deadlock was provoked: the test tests nothing"
-    with open_store(mariadb_url) as store:
+    assert deadlocks(server_url) > met, "no deadlock was provoked: the test tests nothing"
+    with open_store(server_url) as store:
         for recording in store.status():
             store.delete_recording(recording.recording_id)
         rows = rows_per_table(store)
@@ -268,14 +273,14 @@ def test_ingest_and_delete_of_one_recording_at_once(long_room: Path, some: Store
         assert content(store)["frames"] == content(some)["frames"]
 
 
-def test_two_ingests_at_once_share_the_work(long_room: Path, some: Store, mariadb_url: str) -> None:
-    make_schema(mariadb_url)
-    processes = [start_ingest(long_room, mariadb_url) for _ in range(2)]
+def test_two_ingests_at_once_share_the_work(long_room: Path, some: Store, server_url: str) -> None:
+    make_schema(server_url)
+    processes = [start_ingest(long_room, server_url) for _ in range(2)]
     answers = [process.communicate(timeout=120) for process in processes]
     assert [process.returncode for process in processes] == [0, 0], answers
     summaries = [json.loads(out)[0] for out, _ in answers]
     assert sum(summary["stored"] for summary in summaries) == SOME
-    with open_store(mariadb_url) as store:
+    with open_store(server_url) as store:
         assert content(store) == content(some)
 
 

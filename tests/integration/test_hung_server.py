@@ -20,11 +20,12 @@ from tests import servers
 
 BOUND_S = 40.0  # limits below add up to a few seconds; without them it would be for ever
 PORT = text("SELECT @@port")
+WORD = "of-both-servers"
 
 
 @pytest.fixture(scope="module")
-def two_servers() -> Iterator[list[servers.Server]]:
-    with servers.server() as one, servers.server() as other:
+def two_servers(server_kind: servers.Kind) -> Iterator[list[servers.Server]]:
+    with servers.server(server_kind, password=WORD) as one, servers.server(server_kind, password=WORD) as other:
         for server in (one, other):
             server.execute("CREATE TABLE semdb.blobs (id INT PRIMARY KEY AUTO_INCREMENT, data LONGBLOB)")
         yield [one, other]

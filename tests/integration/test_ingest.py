@@ -65,11 +65,11 @@ def test_ingest_stores_what_it_says_and_again_adds_nothing(room: Path, database_
         assert dump(store) == before
 
 
-def test_both_servers_hold_equal_rows(room: Path, tmp_path: Path, mariadb_url: str) -> None:
+def test_both_servers_hold_equal_rows(room: Path, tmp_path: Path, server_url: str) -> None:
     from semdb.database import schema
     from semdb.database.engine import make_engine
 
-    urls = [f"sqlite:///{tmp_path / 'one.sqlite3'}", mariadb_url]
+    urls = [f"sqlite:///{tmp_path / 'one.sqlite3'}", server_url]
     dumps = []
     for url in urls:
         engine = make_engine(url)

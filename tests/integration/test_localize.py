@@ -296,12 +296,12 @@ def test_evaluate_on_a_server_that_does_not_answer(room: Path) -> None:
 
 
 def test_evaluate_on_a_server_gives_the_same_figures_and_leaves_nothing(
-    room: Path, mariadb_url: str, tmp_path: Path
+    room: Path, any_server_url: str, tmp_path: Path
 ) -> None:
     from sqlalchemy import create_engine, text
 
     files = []
-    for number, url in enumerate((f"sqlite:///{tmp_path / 'x.sqlite3'}", mariadb_url)):
+    for number, url in enumerate((f"sqlite:///{tmp_path / 'x.sqlite3'}", any_server_url)):
         files.append(tmp_path / f"{number}.json")
         done = semdb("evaluate", room, "--keyframes", 6, "--max-queries", 5, "--json", files[-1], url=url)
         assert done.returncode == 0, done.stderr
@@ -311,7 +311,7 @@ def test_evaluate_on_a_server_gives_the_same_figures_and_leaves_nothing(
         for query in result["per_query"]:
             del query["timing_ms"]
     assert one == two
-    engine = create_engine(mariadb_url)
+    engine = create_engine(any_server_url)
     with engine.connect() as connection:
         schemas = connection.execute(text("SHOW DATABASES LIKE 'semdb_evaluate%'")).all()
     engine.dispose()

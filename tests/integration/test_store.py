@@ -263,9 +263,9 @@ def test_the_log_of_queries(store: Store) -> None:
     assert '"cosine": null' in rows[0].candidates
 
 
-def test_rows_are_equal_on_both_servers(tmp_path: Path, mariadb_url: str) -> None:
+def test_rows_are_equal_on_both_servers(tmp_path: Path, server_url: str) -> None:
     contents = []
-    for url in (f"sqlite:///{tmp_path / 'a.sqlite3'}", mariadb_url):
+    for url in (f"sqlite:///{tmp_path / 'a.sqlite3'}", server_url):
         engine = make_engine(url)
         schema.upgrade(engine)
         engine.dispose()

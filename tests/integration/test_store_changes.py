@@ -197,7 +197,7 @@ def test_a_value_that_the_server_does_not_take_is_refused_before_it_is_sent(stor
     if store.engine.dialect.name == "sqlite":  # has no such limit
         assert store.write_keyframe(planned.recording_id, large).created
         return
-    with pytest.raises(DatabaseError, match=r"keyframe_images row of frame 1 .*MiB.*max_allowed_packet"):
+    with pytest.raises(DatabaseError, match=r"keyframe_images row of frame 1 .*bytes.*max_allowed_packet"):
         store.write_keyframe(planned.recording_id, large)
     assert rows_per_table(store)["keyframes"] == 0
     assert store.write_keyframe(planned.recording_id, record(1, description(1))).created

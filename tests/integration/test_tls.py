@@ -61,9 +61,11 @@ def certificates() -> Iterator[Path]:
 
 
 @pytest.fixture(scope="module")
-def server(certificates: Path) -> Iterator[servers.Server]:
+def server(server_kind: servers.Kind, certificates: Path) -> Iterator[servers.Server]:
     files = {"cert": certificates / "server.pem", "key": certificates / "server.key"}
-    with servers.server(*(f"--ssl-{name}={path}" for name, path in files.items())) as made:
+    with servers.server(
+        server_kind, *server_kind.with_tls, *(f"--ssl-{n}={path}" for n, path in files.items())
+    ) as made:
         yield made
 
 
@@ -94,21 +96,22 @@ def test_a_certificate_that_is_not_trusted_is_refused(server: servers.Server, ce
     where = "answers, but TLS failed: check that ssl_ca of SEMDB_DATABASE_URL is"
     with pytest.raises(DatabaseError, match=rf"{where}.*self-signed certificate") as caught:
         cipher(server.url(query=f"?ssl_ca={certificates / 'elsewhere.pem'}"))
-    assert servers.PASSWORD not in str(caught.value)
+    assert str(server.admin.password) not in str(caught.value)
     name = server.url(query=f"?ssl_ca={certificates / 'server.pem'}").replace("127.0.0.1", "localhost")
     with pytest.raises(DatabaseError, match=rf"{where}.*mismatch"):
         cipher(name)
 
 
-def test_a_server_without_tls_is_refused_where_the_url_asks_for_it(mariadb_url: str) -> None:
-    assert cipher(f"{mariadb_url}?ssl_mode=DISABLED") == ""
-    assert cipher(f"{mariadb_url}?ssl_mode=PREFERRED") == ""
+def test_a_server_without_tls_is_refused_where_the_url_asks_for_it(server_url: str) -> None:
+    assert cipher(f"{server_url}?ssl_mode=DISABLED") == ""
+    assert cipher(f"{server_url}?ssl_mode=PREFERRED") == ""
     with pytest.raises(DatabaseError, match="has no TLS, and SEMDB_DATABASE_URL asks for it"):
-        cipher(f"{mariadb_url}?ssl_mode=REQUIRED")
+        cipher(f"{server_url}?ssl_mode=REQUIRED")
 
 
 def test_a_server_that_takes_tls_only(server: servers.Server) -> None:
-    server.execute("CREATE OR REPLACE USER 'careful'@'127.0.0.1' IDENTIFIED BY 'hush' REQUIRE SSL")
+    server.execute("DROP USER IF EXISTS 'careful'@'127.0.0.1'")
+    server.execute("CREATE USER 'careful'@'127.0.0.1' IDENTIFIED BY 'hush' REQUIRE SSL")
     server.execute("GRANT ALL ON semdb.* TO 'careful'@'127.0.0.1'")
     url = f"mysql+pymysql://careful:hush@127.0.0.1:{server.port}/semdb"
     assert cipher(url) != ""

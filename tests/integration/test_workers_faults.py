@@ -108,17 +108,17 @@ def test_a_worker_with_other_models_leaves_the_work_to_others(small: Path, undis
 
 
 def test_a_worker_that_may_not_into_the_database_leaves_the_work_to_others(
-    small: Path, undisturbed: Store, mariadb_url: str, tmp_path: Path
+    small: Path, undisturbed: Store, any_server_url: str, tmp_path: Path
 ) -> None:
-    assert semdb("init", url=mariadb_url).returncode == 0
-    host = mariadb_url.partition("@")[2]
+    assert semdb("init", url=any_server_url).returncode == 0
+    host = any_server_url.partition("@")[2]
     with services.redis(tmp_path) as broker:
-        queue(small, mariadb_url, broker)
+        queue(small, any_server_url, broker)
         wrong = start(tmp_path, f"mysql+pymysql://nobody:outdated@{host}", broker.url)
-        with services.workers(wrong) as running, open_store(mariadb_url) as store:
+        with services.workers(wrong) as running, open_store(any_server_url) as store:
             services.wait_until(lambda: wrong.text().count("refused recording=1") >= 2, "it has refused two messages")
             assert "refuses: check user, password" in wrong.text()
-            running.append(start(tmp_path, mariadb_url, broker.url))
+            running.append(start(tmp_path, any_server_url, broker.url))
             services.wait_until(lambda: is_complete(store), "the other worker does all")
             assert content(store) == content(undisturbed)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import sqlite3
 import subprocess
 import sys
 from pathlib import Path
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from semdb.cli.completion import Line, offer, split_line, values
+from semdb.cli.completion import VARIABLE, Line, answer, offer, split_line, values
 from semdb.cli.completion.shells import BASH, ZSH, Shell, install
 from semdb.cli.main import COMMANDS, app
 from semdb.database.store import open_store
@@ -95,6 +96,38 @@ def test_names_are_those_of_the_database_that_the_line_names() -> None:
     before = sorted(path.name for path in Path().iterdir())
     assert offered(f"semdb status --database-url sqlite:///{Path('semdb.sqlite3').absolute()} --map h") == ["hall 2"]
     assert sorted(path.name for path in Path().iterdir()) == before
+
+
+def test_names_are_no_code_of_the_shell(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = [
+        "room$(reboot)",
+        'room"; reboot; "',
+        "room`reboot`",
+        "room\\",
+        "room\x1b[31m",
+        "room\nforged",
+        "room 2",
+        "rooms",
+    ]
+    with sqlite3.connect("semdb.sqlite3") as connection:
+        connection.execute("UPDATE maps SET name = 'room' || char(10) || 'forged\tx' WHERE name = 'hall 2'")
+        connection.executemany("INSERT INTO maps (name) VALUES (?)", [(name,) for name in names])
+    for line, expected in (
+        (
+            "semdb status --map ro",
+            {"room", "room$(reboot)", 'room"; reboot; "', "room`reboot`", "room\\", "room 2", "rooms"},
+        ),
+        ('semdb status --map "ro', {"room", "room 2", "rooms"}),
+        ("semdb status --database-url 'sqlite:///semdb.sqlite3' --map ro", {"room", "room 2", "rooms"}),
+    ):
+        monkeypatch.setenv(VARIABLE, line)
+        kind, *lines = answer(typer.main.get_command(app)).split("\n")
+        assert kind == "plain"
+        assert {entry.split("\t")[0] for entry in lines} == expected
+    monkeypatch.setenv(VARIABLE, "semdb delete recording corr")  # its description names the map
+    assert answer(typer.main.get_command(app)).split("\n")[1:] == [
+        r"corridor	a recording in the map room\nforged\tx"
+    ]
 
 
 def test_fixed_values_are_those_that_there_are() -> None:

@@ -122,5 +122,24 @@ def test_every_setting_is_documented_with_its_default() -> None:
         assert default in row, f"docs/settings.md: SEMDB_{name.upper()} has the default {default}"
 
 
+# Where text goes to a terminal or into a page as it is; everything else goes through what escapes names (semdb.shown).
+PRINTERS = ("cli/output.py", "cli/progress.py", "cli/main.py", "cli/ending.py")
+RAW = re.compile(r"(?<![\w.])print\(|sys\.std(?:out|err)\.write\(|typer\.echo\(|from html import|html\.escape\(")
+RAW_ALLOWED = {"semdb/cli/status.py": 1, "semdb/shown.py": 1}  # fixed text; the escaping
+
+
+def test_text_reaches_terminals_and_pages_through_what_escapes_it() -> None:
+    found = []
+    for folder in ("semdb", "workers"):
+        for file in sorted((REPOSITORY / folder).rglob("*.py")):
+            name = file.relative_to(REPOSITORY).as_posix()
+            if name.endswith(PRINTERS):
+                continue
+            lines = file.read_text().splitlines()
+            raw = [f"{name}:{number}: {line.strip()}" for number, line in enumerate(lines, 1) if RAW.search(line)]
+            found += raw[RAW_ALLOWED.get(name, 0) :]
+    assert not found, "use print_lines, print_table, print_json, say, or for_html:\n" + "\n".join(found)
+
+
 def test_groups_are_typer_apps() -> None:
     assert isinstance(__import__("semdb.cli.models", fromlist=["command"]).command, typer.Typer)

@@ -7,15 +7,18 @@ The script of the shell (`semdb.cli.completion.shells`) calls `semdb` with the l
 from __future__ import annotations
 
 import os
+import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from semdb.cli.completion.values import of_argument, of_option
+from semdb.shown import for_terminal
 
 VARIABLE = "_SEMDB_COMPLETE"
 BREAKS = "_SEMDB_BREAKS"  # characters that the shell divides words at, beside spaces
+_HARMLESS = re.compile(r"[\w@%+=:,./ -]+")
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,15 +95,18 @@ def answer(root: Any) -> str:
     """What the script of the shell reads: ``files`` or ``plain``, then a line per value with what it is behind a tab.
 
     A value is what stands for the part of the word that the shell replaces: behind the last of the characters in
-    `BREAKS`, and of an option with its value (``--map=room``) the value.
+    `BREAKS`, and of an option with its value (``--map=room``) the value. In a line with a quotation mark bash puts it
+    in as it is: there only names are offered that mean nothing to a shell.
     """
-    line = split_line(os.environ[VARIABLE])
+    typed = os.environ[VARIABLE]
+    line = split_line(typed)
     found = offer(root, line, os.environ)
     cut = 0
     if not line.quoted and not line.word.startswith("-"):
         cut = 1 + max((line.word.rfind(sign) for sign in os.environ.get(BREAKS, "")), default=-1)
     lines = ["files" if found.files else "plain"]
-    lines += [f"{value[cut:]}\t{text}" for value, text in found.entries if value[cut:] and value.isprintable()]
+    fit = _HARMLESS.fullmatch if "'" in typed or '"' in typed else str.isprintable
+    lines += [f"{value[cut:]}\t{for_terminal(text)}" for value, text in found.entries if value[cut:] and fit(value)]
     return "\n".join(lines)
 
 
