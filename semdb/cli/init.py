@@ -16,31 +16,40 @@ def command(
     accounts: Annotated[
         bool, typer.Option("--accounts", help="Instead: print the SQL of the accounts owner, writer and reader.")
     ] = False,
+    reader: Annotated[
+        bool, typer.Option("--reader", help="Instead: print the SQL of the account of `semdb sql` alone.")
+    ] = False,
     execute: Annotated[
-        bool, typer.Option("--execute", help="With --accounts: create them, as the account of the database URL.")
+        bool,
+        typer.Option("--execute", help="With --accounts or --reader: create them, as the account of the database URL."),
     ] = False,
 ) -> None:
     """Create or upgrade the schema; nothing happens when it is there."""
     from semdb.errors import UsageError
 
     url = overrides.settings().database_url
-    if execute and not accounts:
-        raise UsageError("--execute goes with --accounts")
-    if accounts:
-        _accounts(url, execute)
+    if execute and not (accounts or reader):
+        raise UsageError("--execute goes with --accounts or --reader")
+    if accounts or reader:
+        _accounts(url, execute, only_reader=not accounts)
     else:
         _init(url)
 
 
-def _accounts(url: str, execute: bool) -> None:
+def _accounts(url: str, execute: bool, *, only_reader: bool) -> None:
     """Print statements and URLs as SQL with comments; with `execute` run them and print the URLs only."""
+    from semdb.database.accounts import ROLES, plan_accounts
     from semdb.database.accounts import execute as run_statements
-    from semdb.database.accounts import plan_accounts
 
-    plan = plan_accounts(url)
+    plan = plan_accounts(url, roles=("reader",) if only_reader else ROLES)
     if execute:
         run_statements(url, plan.statements)
-        print_lines("created the accounts; nothing else remembers their passwords:")
+        what = (
+            "account; nothing else remembers its password"
+            if only_reader
+            else "accounts; nothing else remembers their passwords"
+        )
+        print_lines(f"created the {what}:")
     else:
         for statement in plan.statements:
             print_lines(f"{statement};")

@@ -72,11 +72,13 @@ def print_json(value: Any, stream: TextIO | None = None) -> None:
 
 
 def cell_text(value: Any) -> str:
-    """One cell of a table for people: numbers whole up to 15 digits, ``<N bytes>`` for blobs, empty for NULL."""
+    """One cell of a table for people: numbers whole up to 15 digits, kind and size of a blob, empty for NULL."""
     if value is None:
         return ""
     if isinstance(value, bytes | bytearray | memoryview):
-        return f"<{len(value)} bytes>"
+        from semdb.database.blob_text import describe_blob
+
+        return describe_blob(bytes(value))
     if hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, float | Decimal):

@@ -37,8 +37,9 @@ def plan_accounts(
     names: Mapping[str, str] | None = None,
     passwords: Mapping[str, str] | None = None,
     host: str = "%",
+    roles: Sequence[str] = ROLES,
 ) -> Accounts:
-    """Accounts for the schema of `url`; nothing is executed.
+    """Accounts for the schema of `url`, of all roles or of `roles`; nothing is executed.
 
     `names` and `passwords` by role; a name that is not given is ``semdb_<role>``, a password is made up. `host` is
     where the accounts may connect from. Raises UsageError for SQLite, which has no accounts, and for impossible names.
@@ -49,9 +50,13 @@ def plan_accounts(
     if not _HOST.fullmatch(host):
         raise UsageError(f"{host!r} is no host for an account")
     schema = parsed.database or ""
-    statements = [f"CREATE DATABASE IF NOT EXISTS {_identifier(schema)} CHARACTER SET utf8mb4 COLLATE utf8mb4_bin"]
+    statements = []
+    if "owner" in roles:
+        statements.append(
+            f"CREATE DATABASE IF NOT EXISTS {_identifier(schema)} CHARACTER SET utf8mb4 COLLATE utf8mb4_bin"
+        )
     urls: dict[str, str] = {}
-    for role in ROLES:
+    for role in roles:
         name = (names or {}).get(role, f"semdb_{role}")
         password = (passwords or {}).get(role) or secrets.token_urlsafe(18)
         if not _NAME.fullmatch(name):

@@ -9,8 +9,10 @@ of uint32, and those of images with a side above 65535 still are. Keypoints may 
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -181,6 +183,36 @@ def decode_keypoints(
         descriptors=descriptors,
     )
     return Keypoints(features, object_index, np.ascontiguousarray(packed[:, 6:9], dtype=np.float32))
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """What the head of a blob says; `size` is width and height of a mask."""
+
+    magic: bytes
+    dtype: str
+    shape: tuple[int, ...]
+    size: tuple[int, int] | None = None
+
+
+def peek(blob: bytes) -> Header | None:
+    """The head of an array, a mask or compact keypoints, unchecked; None for what is none or does not fit its size."""
+    if len(blob) < _HEADER.size or blob[:4] not in (ARRAY_MAGIC, MASK_MAGIC, COMPACT_MAGIC):
+        return None
+    magic, version, code, ndim, _, _ = _HEADER.unpack_from(blob)
+    dtype = _DTYPES.get(code)
+    start = _HEADER.size + 4 * ndim
+    if dtype is None or ndim > 8 or not 1 <= version <= VERSION or len(blob) < start:
+        return None
+    shape = struct.unpack_from(f"<{ndim}I", blob, _HEADER.size)
+    if len(blob) != start + dtype.itemsize * math.prod(shape):
+        return None
+    if magic != MASK_MAGIC:
+        return Header(magic, dtype.name, shape)
+    if math.prod(shape) < 2 or code not in (_CODES[np.dtype("<u2")], _CODES[np.dtype("<u4")]):
+        return None
+    height, width = np.frombuffer(blob, dtype, 2, start).tolist()
+    return Header(magic, dtype.name, shape, (width, height))
 
 
 def image_format(data: bytes | None) -> str:

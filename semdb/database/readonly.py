@@ -79,6 +79,8 @@ def _sqlite(settings: Settings, sql: str) -> Generator[Row, None, None]:
             yield from rows
     except sqlite3.Error as error:
         if "interrupted" in str(error):
+            if time.monotonic() < deadline:  # Ctrl-C, which sqlite3 does not pass on
+                raise KeyboardInterrupt from error
             raise _too_slow(settings) from error
         raise DatabaseError(f"the database refused the statement: {error}") from error
     finally:
@@ -100,12 +102,18 @@ def _too_slow(settings: Settings) -> DatabaseError:
     )
 
 
+def _no_reader(settings: Settings) -> str:
+    url = parse_url(settings.database_url).set(username="ADMIN", password="PASSWORD", query={})
+    return (
+        "on a server statements run as an account that may only read, which SEMDB_READER_URL names; it is not set. "
+        "This makes such an account and prints the URL to set, ADMIN being one that may create accounts: "
+        f"semdb init --reader --execute --database-url {url.render_as_string(hide_password=False)}"
+    )
+
+
 def _server(settings: Settings, sql: str) -> Generator[Row, None, None]:
     if not settings.reader_url:
-        raise UsageError(
-            "on a server this needs an account that may only read: set SEMDB_READER_URL to its URL; "
-            "`semdb init --accounts` prints the statements that make one"
-        )
+        raise UsageError(_no_reader(settings))
     # A little more than the server's own limit, which gives the better message.
     engine = make_engine(settings.reader_url, read_timeout_s=int(settings.sql_time_limit_s) + 10)
     try:

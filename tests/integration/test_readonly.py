@@ -14,12 +14,15 @@ from sqlalchemy import text
 from sqlalchemy.engine import make_url
 
 from semdb.database import accounts, schema
+from semdb.database.catalogue import tables_and_columns
 from semdb.database.engine import make_engine
 from semdb.database.readonly import excess_rights, run_readonly
 from semdb.database.store import Store, open_store
+from semdb.database.tables import metadata
 from semdb.errors import DatabaseError, SchemaError, UsageError
 from semdb.settings import Settings
 from tests.database_samples import MODELS, description, fill, plan, record
+from tests.rooms import semdb
 from tests.servers import TestServer
 
 WRITES = [
@@ -180,11 +183,43 @@ def test_a_sqlite_file_that_is_not_there_is_not_made(tmp_path: Path) -> None:
 
 
 def test_a_server_needs_a_reader(server_url: str, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"SEMDB_READER_URL.*semdb init --accounts"):
+    with pytest.raises(UsageError, match=r"SEMDB_READER_URL.*semdb init --reader --execute .*ADMIN:PASSWORD@") as told:
         run_readonly(Settings(database_url=server_url, reader_url=None), "SELECT 1")
+    assert str(make_url(server_url).database) in str(told.value)
     file = f"sqlite:///{tmp_path / 'a.sqlite3'}"
     with pytest.raises(UsageError, match="names a SQLite file"):
         run_readonly(Settings(database_url=server_url, reader_url=file), "SELECT 1")
+
+
+def test_the_command_that_the_error_names_makes_a_reader(database_server: TestServer, server_url: str) -> None:
+    """Where the writer's account is the only one: the command as it is printed, as one that may make others."""
+    engine = make_engine(server_url)
+    schema.upgrade(engine)
+    engine.dispose()
+    refused = semdb("sql", "SELECT 1", url=server_url)
+    assert refused.returncode == 2
+    named = refused.stderr.rpartition("semdb init")[2].split()
+    admin = make_url(server_url)
+    assert [*named[:-1]] == ["--reader", "--execute", "--database-url"]
+    assert named[-1] == admin.set(username="ADMIN", password="PASSWORD", query={}).render_as_string(hide_password=False)
+    try:
+        printed = semdb("init", "--reader", url=server_url).stdout
+        assert printed.startswith("CREATE USER 'semdb_reader'@'%'")
+        assert "semdb_writer" not in printed
+        made = semdb("init", *named[:-1], server_url, url="sqlite:///nothing.sqlite3")
+        assert made.returncode == 0, made.stderr
+        assert made.stdout.startswith(
+            "created the account; nothing else remembers its password:\nreader (SEMDB_READER_URL)"
+        )
+        reader = made.stdout.split()[-1]
+        done = semdb("sql", "SELECT 1 AS one", url=server_url, SEMDB_READER_URL=reader)
+        assert done.stdout == "one\n---\n  1\n"
+        known = tables_and_columns(Settings(database_url=server_url, reader_url=reader))
+        for table in metadata.tables.values():
+            assert known[table.name] == tuple(column.name for column in table.columns)
+        assert "category" in known["keyframe_objects"]
+    finally:
+        database_server.execute("DROP USER IF EXISTS 'semdb_reader'@'%'")
 
 
 @pytest.mark.parametrize(

@@ -184,9 +184,9 @@ def printed(fmt: str) -> str:
 def test_table() -> None:
     assert printed("table").splitlines() == [
         "id  name          score  count  mask",
-        "--  ------------  -----  -----  ---------",
-        " 1  cup             0.5         <3 bytes>",
-        "12  dining table    nan      3  <0 bytes>",
+        "--  ------------  -----  -----  -------------",
+        " 1  cup             0.5         blob, 3 bytes",
+        "12  dining table    nan      3  blob, 0 bytes",
     ]
 
 
