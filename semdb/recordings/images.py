@@ -214,13 +214,18 @@ def decode_gray(data: bytes, name: str) -> npt.NDArray[Any]:
 
     Raises FrameError that begins with `name`.
     """
-    try:
-        image = _decode(data, cv2.IMREAD_UNCHANGED)
-    except ImageFileError as error:
-        raise FrameError(f"{name}: {error}") from error
+    image = decode_any(data, name)
     if image.ndim != 2:
         raise FrameError(f"{name}: needs one channel, but has {image.shape[2]}")
     return image
+
+
+def decode_any(data: bytes, name: str) -> npt.NDArray[Any]:
+    """The values of an image in memory as they are; colour in OpenCV's order. Raises FrameError."""
+    try:
+        return _decode(data, cv2.IMREAD_UNCHANGED)
+    except ImageFileError as error:
+        raise FrameError(f"{name}: {error}") from error
 
 
 def decode_depth(data: bytes, name: str, depth_scale: float, size: tuple[int, int]) -> Float32Array:

@@ -7,12 +7,15 @@ from pathlib import Path
 
 from semdb.errors import RecordingError, UsageError
 from semdb.recordings import (
+    colmap_model,
     icl_nuim,
+    kapture,
     nice_slam,
     polycam,
     record3d,
     redwood,
     ros_bag,
+    rtabmap,
     scannet,
     seven_scenes,
     stray_scanner,
@@ -35,6 +38,9 @@ LAYOUTS: tuple[Layout, ...] = (
     nice_slam.LAYOUT,
     redwood.LAYOUT,
     ros_bag.LAYOUT,
+    rtabmap.LAYOUT,
+    kapture.LAYOUT,
+    colmap_model.LAYOUT,
 )
 CHILDREN_LOOKED_AT = 200
 

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import json
+import sqlite3
 import struct
 import zipfile
 import zlib
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from semdb.geometry import invert_pose, quat_wxyz_from_rotation
+from semdb.geometry import invert_pose, pose_from, quat_wxyz_from_rotation, so3_exp
 from semdb.recordings.options import BACK
 from semdb.recordings.own_depth import resized
+from semdb.recordings.rvl import encode_rvl
 from semdb.types import Camera, FloatArray
 from tests.unit.recording_miniatures import depth_units, pose, render, write_image
 
@@ -188,3 +191,92 @@ def write_redwood(folder: Path, n: int = 4, camera: Camera = PHONE) -> Path:
 
 def camera_from_world(world_from_camera: FloatArray) -> FloatArray:
     return np.asarray(invert_pose(world_from_camera))
+
+
+@dataclass
+class RtabmapPlan:
+    """What is written into a database of RTAB-Map: poses of nodes are drifted odometry unless there are no others."""
+
+    frames: int = 4
+    depth: str = "rvl"  # rvl, png, float or none
+    depth_factor: int = 1  # colour is so many times larger
+    cameras: int = 1
+    optimised: bool = True
+    version: str = "0.23.8"
+    calibration: str = "models"  # models, floats
+
+
+BASE_FROM_CAMERA = np.array([[0.0, 0, 1, 0.1], [-1, 0, 0, 0.0], [0, -1, 0, 0.4], [0, 0, 0, 1]])
+
+
+def rtabmap_camera_pose(i: int, part: int) -> FloatArray:
+    """The second camera looks 0.3 rad to the side."""
+    return pose(i) @ pose_from(so3_exp([0.0, 0.3 * part, 0.0]), [0.02 * part, 0.0, 0.0])
+
+
+def write_rtabmap(path: Path, plan: RtabmapPlan | None = None, camera: Camera = PHONE) -> Path:
+    plan = plan or RtabmapPlan()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    connection = sqlite3.connect(path)
+    connection.executescript(
+        "CREATE TABLE Node (id INTEGER PRIMARY KEY, map_id INTEGER, weight INTEGER, stamp FLOAT, pose BLOB, "
+        "label TEXT);"
+        "CREATE TABLE Data (id INTEGER PRIMARY KEY, image BLOB, depth BLOB, calibration BLOB);"
+        "CREATE TABLE Link (from_id INTEGER, to_id INTEGER, type INTEGER, information_matrix BLOB, transform BLOB);"
+        "CREATE TABLE Feature (node_id INTEGER); CREATE TABLE Word (id INTEGER);"
+        "CREATE TABLE Admin (version TEXT, opt_ids BLOB, opt_poses BLOB);"
+    )
+    bases = []
+    for i in range(plan.frames):
+        base = pose(i) @ invert_pose(BASE_FROM_CAMERA)
+        bases.append(base)
+        drifted = base.copy()
+        drifted[0, 3] += 0.1 * i if plan.optimised else 0.0
+        images, depths = [], []
+        small = resized(camera, camera.width // plan.depth_factor, camera.height // plan.depth_factor)
+        for part in range(plan.cameras):
+            images.append(render(camera, rtabmap_camera_pose(i, part))[0])
+            depths.append(render(small, rtabmap_camera_pose(i, part))[1])
+        done, data = cv2.imencode(".jpg", np.hstack(images)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 98])
+        assert done
+        depth = None if plan.depth == "none" else _rtabmap_depth(np.hstack(depths), plan.depth)
+        weight = -1 if i == 99 else 0
+        connection.execute(
+            "INSERT INTO Node VALUES (?, 0, ?, ?, ?, '')",
+            (i + 1, weight, 100.0 + i, drifted[:3].astype("<f4").tobytes()),
+        )
+        calibration = b"".join(_rtabmap_calibration(plan, camera, part) for part in range(plan.cameras))
+        connection.execute("INSERT INTO Data VALUES (?, ?, ?, ?)", (i + 1, data.tobytes(), depth, calibration))
+    ids = poses = None
+    if plan.optimised:
+        ids = _rtabmap_matrix(np.arange(1, plan.frames + 1, dtype="<i4")[None], 4)
+        poses = _rtabmap_matrix(np.stack([base[:3].ravel() for base in bases]).astype("<f4"), 5)
+    connection.execute("INSERT INTO Admin VALUES (?, ?, ?)", (plan.version, ids, poses))
+    connection.commit()
+    connection.close()
+    return path
+
+
+def _rtabmap_matrix(values: np.ndarray, kind: int) -> bytes:
+    return zlib.compress(values.tobytes()) + struct.pack("<3i", values.shape[0], values.shape[1], kind)
+
+
+def _rtabmap_depth(z: np.ndarray, form: str) -> bytes:
+    if form == "rvl":
+        return b"DEPTHRVL" + struct.pack("<II", z.shape[1], z.shape[0]) + encode_rvl(depth_units(z, 1000))
+    values = depth_units(z, 1000) if form == "png" else z.astype("<f4").view(np.uint8).reshape(*z.shape, 4)
+    done, data = cv2.imencode(".png", values)
+    assert done
+    return data.tobytes()
+
+
+def _rtabmap_calibration(plan: RtabmapPlan, camera: Camera, part: int) -> bytes:
+    local = BASE_FROM_CAMERA @ invert_pose(pose(0)) @ rtabmap_camera_pose(0, part)
+    floats = local[:3].astype("<f4").tobytes()
+    if plan.calibration == "floats":
+        head = struct.pack("<6f", camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+        return head + floats
+    head = struct.pack("<11i", 0, 23, 8, 0, camera.width, camera.height, 9, 5, 9, 12, 12)
+    projection = np.column_stack([camera.matrix, np.zeros(3)])
+    parts = (camera.matrix, np.array([0.1, 0.2, 0, 0, 0]), np.eye(3), projection)
+    return head + b"".join(np.ascontiguousarray(value, "<f8").tobytes() for value in parts) + floats
