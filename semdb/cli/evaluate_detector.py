@@ -25,7 +25,7 @@ def command(
     from dataclasses import asdict
 
     from semdb.cli.output import print_lines, print_table, to_jsonable
-    from semdb.cli.progress import Progress
+    from semdb.cli.progress import Progress, say
     from semdb.cli.train import classes_of
     from semdb.perception.detectors import load_detector
     from semdb.training.coco import load_coco
@@ -33,12 +33,21 @@ def command(
 
     settings = load_settings(score_threshold=LEAST_SCORE, **({} if device is None else {"device": device}))
     data = load_coco(coco, split, classes_of(coco, split, classes))
+    for note in data.notes:
+        say(note)
     loaded = load_detector(detector, settings)
     with Progress("detecting", unit="images") as progress:
         found = evaluate_detector(loaded, data, progress.update)
     if json_file is not None:
-        scores = to_jsonable({"detector": loaded.info.name, "data": str(data.file), **asdict(found)})
+        classes_found = {name: value if value >= 0 else None for name, value in found.class_ap50.items()}
+        kept = {**asdict(found), "class_ap50": classes_found}
+        scores = to_jsonable({"detector": loaded.info.name, "data": str(data.file), **kept})
         json_file.write_text(json.dumps(scores) + "\n")
+    if found.marked:
+        say(
+            f"{found.marked} image(s) have an orientation mark, which is not applied: annotations must be of the "
+            "pixels as stored"
+        )
     print_lines(f"{loaded.info.name} on {data.file}: {found.images} images, {found.objects} objects")
     rows = [
         [what, *(f"{value:.3f}" for value in scores.values)]
@@ -50,4 +59,5 @@ def command(
         )
     ]
     print_table(("", *MEASURES), rows)
-    print_lines("AP50 of boxes: " + ", ".join(f"{name} {value:.3f}" for name, value in found.class_ap50.items()))
+    per_class = (f"{name} {value:.3f}" if value >= 0 else f"{name} none" for name, value in found.class_ap50.items())
+    print_lines("AP50 of boxes: " + ", ".join(per_class))

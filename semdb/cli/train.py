@@ -80,7 +80,7 @@ def train_detector(
     settings = load_settings(**({} if device is None else {"device": device}))
     try:
         with Progress("training", unit="steps") as progress:
-            done = train(options, settings, resume=resume, progress=progress.go_on)
+            done = train(options, settings, resume=resume, progress=progress.go_on, say=say)
     except KeyboardInterrupt:
         if (output / CHECKPOINT).exists():
             say(f"{output / CHECKPOINT} is kept: the same command with --resume goes on from it")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +11,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from semdb.errors import TrainingError
+from semdb.errors import FrameError, TrainingError
+from semdb.files import MissingFileError, UnusableFileError, read_json
+from semdb.recordings.images import decode_color, orientation_of, read_bytes
 from semdb.types import BoolArray, ImageArray
 
 BACKGROUND = "background"
+MOST_COCO_BYTES = 1 << 31
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,6 +55,7 @@ class CocoData:
     classes: tuple[str, ...]
     category_ids: tuple[int, ...]
     pictures: tuple[Picture, ...]
+    notes: tuple[str, ...] = ()  # for people
 
 
 def load_coco(folder: Path, split: str, classes: Sequence[str] | None = None) -> CocoData:
@@ -63,22 +66,23 @@ def load_coco(folder: Path, split: str, classes: Sequence[str] | None = None) ->
     """
     file = folder / "annotations" / f"instances_{split}.json"
     try:
-        content = json.loads(file.read_text())
-    except FileNotFoundError:
+        content = read_json(file, MOST_COCO_BYTES)
+    except MissingFileError:
         there = sorted(path.stem.removeprefix("instances_") for path in file.parent.glob("instances_*.json"))
         raise TrainingError(
             f"{file} is not there: COCO-format data have annotations/instances_SPLIT.json and their images in SPLIT/"
             + (f"; splits in it: {', '.join(there)}" if there else "")
         ) from None
-    except (OSError, ValueError) as error:
-        raise TrainingError(f"{file} cannot be read as JSON ({error})") from error
+    except UnusableFileError as error:
+        where = "" if error.line is None else f"line {error.line}: "
+        raise TrainingError(f"{file} cannot be read as JSON ({where}{error})") from error
     try:
         if not isinstance(content, dict) or not {"images", "annotations", "categories"} <= set(content):
             raise TypeError("it is no object with images, annotations and categories")
         return _parse(content, file, _image_folder(folder, split), classes)
     except KeyError as error:
         raise TrainingError(f"{file} is not in COCO's format: one of its entries has no {error}") from error
-    except (TypeError, ValueError, AttributeError) as error:
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
         raise TrainingError(f"{file} is not in COCO's format: {error}") from error
 
 
@@ -90,16 +94,25 @@ def _image_folder(folder: Path, split: str) -> Path:
 
 
 def _parse(content: dict[str, Any], file: Path, images: Path, wanted: Sequence[str] | None) -> CocoData:
-    by_name = {str(category["name"]): int(category["id"]) for category in content["categories"]}
+    notes: list[str] = []
+    by_name: dict[str, int] = {}
+    for category in content["categories"]:
+        by_name.setdefault(str(category["name"]), int(category["id"]))
+    if len(by_name) < len(content["categories"]):
+        notes.append(f"{file}: a class is listed more than once; all its ids are taken for the same class")
     names = list(wanted) if wanted is not None else sorted(by_name, key=lambda name: by_name[name])
     unknown = [name for name in names if name not in by_name]
     if unknown:
         raise TrainingError(f"{file} has no class {', '.join(unknown)}; it has {', '.join(sorted(by_name))}")
-    label_of = {by_name[name]: k for k, name in enumerate(names, start=1)}
-    instances: dict[int, list[Instance]] = {int(image["id"]): [] for image in content["images"]}
+    labels = {name: k for k, name in enumerate(names, start=1)}
+    label_of = {int(category["id"]): labels.get(str(category["name"])) for category in content["categories"]}
+    images_listed = _once(content["images"], file, notes)
+    instances: dict[int, list[Instance]] = {int(image["id"]): [] for image in images_listed}
+    strange = 0
     for row in content["annotations"]:
         label = label_of.get(int(row["category_id"]))
         if label is None:
+            strange += int(row["category_id"]) not in label_of
             continue
         if int(row["image_id"]) not in instances:
             raise TrainingError(f"{file}: annotation {row['id']} is of image {row['image_id']}, which is not listed")
@@ -116,11 +129,34 @@ def _parse(content: dict[str, Any], file: Path, images: Path, wanted: Sequence[s
             tuple(one for one in instances[int(image["id"])] if _is_learnt(one)),
             tuple(one for one in instances[int(image["id"])] if not _is_learnt(one)),
         )
-        for image in content["images"]
+        for image in images_listed
     )
     if not pictures:
         raise TrainingError(f"{file} lists no image")
-    return CocoData(file, (BACKGROUND, *names), tuple(by_name[name] for name in names), pictures)
+    if strange:
+        notes.append(f"{file}: {strange} annotation(s) of classes that are not listed are left out")
+    ids = tuple(by_name[name] for name in names)
+    return CocoData(file, (BACKGROUND, *names), ids, pictures, tuple(notes))
+
+
+def _once(listed: Sequence[dict[str, Any]], file: Path, notes: list[str]) -> list[dict[str, Any]]:
+    """The images by their id, each once, and a note on those that were listed again, by id or by file."""
+    by_id: dict[int, dict[str, Any]] = {}
+    for image in listed:
+        by_id.setdefault(int(image["id"]), image)
+    files: dict[str, int] = {}
+    for image in by_id.values():
+        files[image["file_name"]] = files.get(image["file_name"], 0) + 1
+    again = len(listed) - len(by_id)
+    if again:
+        notes.append(f"{file}: {again} image(s) are listed twice; the first entry of each id is kept")
+    double = [name for name, count in files.items() if count > 1]
+    if double:
+        notes.append(
+            f"{file}: {len(double)} image file(s) are listed under several ids, as {double[0]}: what is annotated "
+            "under one of them counts as missing under the others"
+        )
+    return list(by_id.values())
 
 
 def _is_learnt(instance: Instance) -> bool:
@@ -128,14 +164,32 @@ def _is_learnt(instance: Instance) -> bool:
 
 
 def read_picture(picture: Picture) -> ImageArray:
-    """The RGB image ``[H, W, 3]``. Raises TrainingError when it cannot be read or has another size than listed."""
-    image = cv2.imread(str(picture.path), cv2.IMREAD_COLOR) if picture.path.is_file() else None
-    if image is None:
-        raise TrainingError(f"{picture.path} (image {picture.image_id}) is not there or is no image")
+    """The RGB image ``[H, W, 3]``; see `read_marked_picture`."""
+    return read_marked_picture(picture)[0]
+
+
+def read_marked_picture(picture: Picture) -> tuple[ImageArray, int]:
+    """The RGB image ``[H, W, 3]`` as stored, and its orientation mark (1: none), which is not applied.
+
+    Raises TrainingError when it cannot be read or has another size than listed.
+    """
+    try:
+        data = read_bytes(picture.path)
+        image = decode_color(data, str(picture.path))
+    except FrameError as error:
+        raise TrainingError(
+            f"{picture.path} (image {picture.image_id}) is not there or is no image ({error})"
+        ) from error
+    mark = orientation_of(data)
     if image.shape[:2] != (picture.height, picture.width):
         found = f"{image.shape[1]}x{image.shape[0]}"
-        raise TrainingError(f"{picture.path} is {found}, but its entry says {picture.width}x{picture.height}")
-    return np.ascontiguousarray(image[..., ::-1])
+        turned = ""
+        if mark > 1 and image.shape[:2] == (picture.width, picture.height):
+            turned = (
+                ": it has an orientation mark, which semdb does not apply; annotations must be of the pixels as stored"
+            )
+        raise TrainingError(f"{picture.path} is {found}, but its entry says {picture.width}x{picture.height}{turned}")
+    return image, mark
 
 
 def mask_of(instance: Instance, picture: Picture) -> BoolArray:

@@ -57,6 +57,7 @@ def train(
     resume: bool = False,
     progress: Progress | None = None,
     stop_after: int | None = None,
+    say: Callable[[str], None] | None = None,
 ) -> Trained:
     """Trains a detector on ``options.coco`` and writes `CHECKPOINT` and `CURVES` into ``options.output``.
 
@@ -68,6 +69,9 @@ def train(
     torch = import_torch()
     torch.set_num_threads(settings.threads)
     data = load_coco(options.coco, options.split, options.classes)
+    if say is not None:
+        for note in data.notes:
+            say(note)
     if not any(picture.instances for picture in data.pictures):
         raise TrainingError(f"{data.file} shows no object of the classes {', '.join(data.classes[1:])}")
     path = options.output / CHECKPOINT

@@ -12,7 +12,7 @@ import numpy as np
 
 from semdb.errors import ModelError, TrainingError, UsageError
 from semdb.perception.protocols import Detector
-from semdb.training.coco import CocoData, Instance, Picture, mask_of, read_picture
+from semdb.training.coco import CocoData, Instance, Picture, mask_of, read_marked_picture
 from semdb.types import Detection
 
 Progress = Callable[[int, int], None]
@@ -37,13 +37,17 @@ class Scores:
 
 @dataclass(frozen=True, slots=True)
 class DetectorScores:
-    """Scores of boxes and masks, and the AP50 of the boxes of each class."""
+    """Scores of boxes and masks, and the AP50 of the boxes of each class (-1 for one of which there is no object).
+
+    `marked` counts images with an orientation mark, which is not applied.
+    """
 
     boxes: Scores
     masks: Scores
     class_ap50: dict[str, float]
     images: int
     objects: int
+    marked: int = 0
 
 
 # the paper's detector (ResNet-101-FPN, fine-tuned) on COCO minival
@@ -55,8 +59,8 @@ def evaluate_detector(detector: Detector, data: CocoData, progress: Progress | N
 
     The detector must have been loaded with a score threshold of `LEAST_SCORE`: precision is taken over all scores.
     Detections of classes that are not in `data` do not count, nor do those inside crowds. Raises ModelError when
-    pycocotools is not installed, TrainingError when the detector knows none of the classes, UsageError when it is no
-    network.
+    pycocotools is not installed, TrainingError when there is no object to find or the detector knows none of the
+    classes, UsageError when it is no network.
     """
     if detector.classes is None:
         raise UsageError(f"{detector.info.name} takes masks that come with a recording: nothing to measure")
@@ -68,10 +72,19 @@ def evaluate_detector(detector: Detector, data: CocoData, progress: Progress | N
     if not set(detector.classes) & set(data.classes[1:]):
         wanted = ", ".join(data.classes[1:])
         raise TrainingError(f"{detector.info.name} knows none of the classes of {data.file}: {wanted}")
+    objects = sum(not one.crowd for picture in data.pictures for one in (*picture.instances, *picture.others))
+    if not objects:
+        raise TrainingError(
+            f"{data.file} has no annotation of the classes {', '.join(data.classes[1:])} in its {len(data.pictures)} "
+            "images: there is nothing to measure"
+        )
     ids = dict(zip(data.classes[1:], data.category_ids, strict=True))
     found: list[dict[str, Any]] = []
+    marked = 0
     for done, picture in enumerate(data.pictures, start=1):
-        for detection in detector.detect(read_picture(picture), None):
+        image, mark = read_marked_picture(picture)
+        marked += mark > 1
+        for detection in detector.detect(image, None):
             if detection.category in ids and not detection.weak:
                 found.append(_result(detection, picture, ids, rle))
         if progress is not None:
@@ -81,10 +94,9 @@ def evaluate_detector(detector: Detector, data: CocoData, progress: Progress | N
         truth.dataset = _dataset(data, rle)
         truth.createIndex()
         scores = {kind: _scores(truth, found, data, kind) for kind in ("bbox", "segm")}
-    objects = sum(not one.crowd for picture in data.pictures for one in (*picture.instances, *picture.others))
     in_order = [data.classes[1 + k] for k in np.argsort(data.category_ids)]  # the evaluator sorts classes by id
     per_class = dict(zip(in_order, scores["bbox"][1], strict=True))
-    return DetectorScores(scores["bbox"][0], scores["segm"][0], per_class, len(data.pictures), objects)
+    return DetectorScores(scores["bbox"][0], scores["segm"][0], per_class, len(data.pictures), objects, marked)
 
 
 def _scores(truth: Any, found: list[dict[str, Any]], data: CocoData, kind: str) -> tuple[Scores, Sequence[float]]:
