@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from semdb.compiled import kernel
-from semdb.geometry.sensor_kernels import depth_sigma
+from semdb.geometry.sensor import AT_LEAST_M, GROWTH_PER_M, NEAREST_M
 from semdb.types import FloatArray, IntArray
 
 PARAMETERS = 9  # of an image
@@ -20,6 +20,12 @@ RESIDUAL = 9  # where the residual is in it
 GREAT = 1e60  # a product greater than that is not to grow on
 # sums may be taken in another order, for vector instructions; what is no number stays none
 FAST = {"reassoc", "contract", "nsz", "arcp"}
+
+
+@kernel
+def depth_sigma(depth: float) -> float:
+    """What `semdb.geometry.sensor.depth_noise` says of one depth; here, since kernels of one file compile together."""
+    return AT_LEAST_M + GROWTH_PER_M * (depth - NEAREST_M) ** 2
 
 
 @kernel(fastmath=FAST, forceinline=True)

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from semdb.geometry import pose_error
-from semdb.geometry.sensor_kernels import depth_sigma
+from semdb.geometry.sensor import depth_noise
+from semdb.localization.bundle_kernels import depth_sigma
 from semdb.localization.matching import Evidence, MatchingOptions
 from semdb.localization.pose import _iterations_for, estimate_pose, first_pose, match_view, rival_pose
 from semdb.localization.pose_options import PoseOptions
@@ -178,6 +179,8 @@ def test_objects_only_uses_no_background() -> None:
 
 def test_depth_noise_grows_with_the_square_of_depth() -> None:
     assert depth_sigma(np.array([0.4]))[0] == pytest.approx(0.0012)
+    z = np.linspace(0.2, 9.0, 200)
+    np.testing.assert_array_equal(depth_noise(z), depth_sigma(z))
     assert depth_sigma(np.array([2.4]))[0] == pytest.approx(0.0012 + 0.0019 * 4)
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from semdb.compiled import kernel
-from semdb.geometry.sensor_kernels import depth_sigma
+from semdb.localization.bundle_kernels import depth_sigma
 from semdb.refinement.points.options import DepthOptions
 from semdb.types import FloatArray, Int64Array, IntArray
 
