@@ -107,6 +107,7 @@ def database(settings: Settings) -> Iterator[Check]:
     from semdb.database import retry, schema
     from semdb.database.engine import make_engine, parse_url, safe_url, sqlite_path
     from semdb.database.inspection import judge, server_facts
+    from semdb.database.sqlite_file import how_it_is_read
 
     url = parse_url(settings.database_url)
     path = sqlite_path(url)
@@ -124,8 +125,8 @@ def database(settings: Settings) -> Iterator[Check]:
         if path is None:
             for finding in judge(server_facts(engine)):
                 yield Check(finding.state, f"database: {finding.what}", finding.text)
-        elif not os.access(path, os.W_OK) or not os.access(path.absolute().parent, os.W_OK):
-            yield Check("problem", "database", f"{path} or its folder cannot be written: change their rights")
+        elif (line := how_it_is_read(path)) is not None:
+            yield Check("problem", "database", f"{line}: nothing can be ingested or logged")
         schema.check_schema(engine)
         yield Check("ok", "schema", f"revision {schema.HEAD}")
     finally:

@@ -27,9 +27,10 @@ def command(
     object; a keypoint without depth has no 3D point.
     """
     from semdb.cli.output import print_rows
+    from semdb.cli.progress import say
     from semdb.database.store import open_store
 
-    with open_store(overrides.settings().database_url) as store:
+    with open_store(overrides.settings().database_url, say=say) as store:
         (loaded,) = store.load_keyframes([keyframe], descriptors=False)
     print_rows(COLUMNS, rows(loaded), "csv" if csv else "table")
 

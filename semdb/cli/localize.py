@@ -59,7 +59,7 @@ def command(
         broken.append(error)
         say(str(error))
 
-    with open_store(settings.database_url) as store:
+    with open_store(settings.database_url, say=say) as store:
         for answer in localize_images(images, depth or [], store, settings, options, say=say, unreadable=unreadable):
             if json:
                 results.append(as_json(answer))

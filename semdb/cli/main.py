@@ -10,14 +10,16 @@ from __future__ import annotations
 import errno
 import importlib
 import os
+import re
 import sys
 import traceback
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
-from semdb.errors import SemdbError
+from semdb.errors import SemdbError, UsageError
 from semdb.shown import for_terminal
 
 # name -> module[:attribute], in the order of the help; the attribute is `command` unless it says otherwise
@@ -54,6 +56,18 @@ def load_command(name: str) -> Any:
     single = typer.Typer(add_completion=False, rich_markup_mode=None)
     single.command(name)(target)
     return typer.main.get_command(single)
+
+
+def refuse_empty(arguments: Sequence[str]) -> None:
+    """Raises UsageError for a value that is given and empty, as ``--map ''`` and ``--map=`` are.
+
+    That is what a shell makes of a variable that is not set: it would mean the default, or anything.
+    """
+    for before, value in zip(("", *arguments), arguments, strict=False):
+        empty = re.fullmatch(r"(--[a-z][a-z-]*)=", value)
+        if value == "" or empty:
+            name = empty[1] if empty else before if before.startswith("--") else "an argument"
+            raise UsageError(f"{name}: the value is empty; give one, or leave it out")
 
 
 def report(error: BaseException) -> int:
@@ -105,6 +119,7 @@ class CommandGroup(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         try:
+            refuse_empty(ctx.args)
             return super().invoke(ctx)
         except _Misuse as error:
             raise _plain(error) from None

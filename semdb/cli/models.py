@@ -212,13 +212,14 @@ def _licence_in(path: Path) -> str:
 
 def used_models(url: str) -> list[dict[str, Any]] | None:
     """The models of each map, None where there is no database file yet. Raises `DatabaseError`."""
+    from semdb.cli.progress import say
     from semdb.database.engine import parse_url, sqlite_path
     from semdb.database.store import open_store
 
     path = sqlite_path(parse_url(url))
     if path is not None and not path.exists():
         return None
-    with open_store(url) as store:
+    with open_store(url, say=say) as store:
         return [
             {"map": known.name, "role": m.role, "name": m.name, "sha256": m.sha256, "config": m.config}
             for known in store.maps()

@@ -34,10 +34,11 @@ def command(
     json: JsonFlag = False,
 ) -> None:
     """Show what is planned, stored and failed of each recording."""
+    from semdb.cli.progress import say
     from semdb.database.store import open_store
 
     rates, settings = Rates(), overrides.settings()
-    with open_store(settings.database_url) as store:
+    with open_store(settings.database_url, say=say) as store:
         while True:
             recordings, failed = look(store, map_name)
             rates.look({recording.recording_id: recording.keyframes for recording in recordings})

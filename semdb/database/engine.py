@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import socket
 from pathlib import Path
 from typing import Any
 
 from sqlalchemy import URL, Connection, Engine, create_engine, event
 from sqlalchemy.engine import make_url
-from sqlalchemy.exc import ArgumentError
+from sqlalchemy.exc import ArgumentError, DisconnectionError
 
+from semdb.database import sqlite_file
 from semdb.database.blobs import BlobCursor
 from semdb.database.hosts import HOSTS, Failover, join_hosts, split_hosts
 from semdb.database.tls import TLS_KEYS, tls_arguments
@@ -19,6 +21,7 @@ CONNECT_TIMEOUT_S = 5
 READ_TIMEOUT_S = 120  # more than the 50 s that a server lets a statement wait for a lock: that answer comes first
 BUSY_TIMEOUT_MS = 30_000
 WRITE = "semdb_write"  # execution option of transactions that may be run again (`retry`): whether they write
+_HINT = "use sqlite:///FILE or mysql+pymysql://USER:PASSWORD@HOST/SCHEMA"
 # Seconds: a machine that is gone is noticed after a minute, also where a statement may take any time.
 _KEEPALIVE = (("TCP_KEEPIDLE", 30), ("TCP_KEEPINTVL", 10), ("TCP_KEEPCNT", 3))
 # What a server may have otherwise for all its connections, and what its statements and results depend on.
@@ -43,16 +46,13 @@ def parse_url(url: str) -> URL:
 
     Several hosts (``HOST1:PORT1,HOST2:PORT2``) become the first one and the query parameter ``hosts``.
     """
-    hint = "use sqlite:///FILE or mysql+pymysql://USER:PASSWORD@HOST/SCHEMA"
     try:
         parsed = make_url(split_hosts(url))
     except (ArgumentError, ValueError):  # they may hold a part of the password
-        raise UsageError(f"the database URL cannot be read; {hint}") from None
+        raise UsageError(f"the database URL cannot be read; {_HINT}") from None
     backend = parsed.get_backend_name()
     if backend == "sqlite":
-        if parsed.database in (None, "", ":memory:"):
-            raise UsageError(f"a database in memory is not supported, it needs a file; {hint}")
-        return parsed.set(drivername="sqlite")
+        return _parse_sqlite(url, parsed)
     if backend in ("mysql", "mariadb"):
         unknown = sorted(set(parsed.query) - TLS_KEYS - {HOSTS})
         if unknown:  # a misspelled ssl_mode must not connect without TLS
@@ -60,14 +60,31 @@ def parse_url(url: str) -> URL:
             where = safe_url(parsed.difference_update_query(unknown))  # they may be passwords
             raise UsageError(f"the database URL {where} has a parameter {unknown[0]!r}; known are {known}")
         if not parsed.database:
-            raise UsageError(f"the database URL {safe_url(parsed)} names no schema; {hint}")
+            raise UsageError(f"the database URL {safe_url(parsed)} names no schema; {_HINT}")
         tls_arguments(parsed)
         return parsed.set(drivername="mysql+pymysql")
-    raise UsageError(f"databases of the kind {backend!r} are not supported; {hint}")
+    raise UsageError(f"databases of the kind {backend!r} are not supported; {_HINT}")
+
+
+def _parse_sqlite(url: str, parsed: URL) -> URL:
+    """The URL of a file, ``~`` expanded. Raises UsageError for what names none."""
+    hint = "use sqlite:///FILE, with a fourth slash for a path from the root"
+    name = parsed.database or ""
+    if parsed.host or parsed.username:
+        raise UsageError(f"the database URL has a host, and SQLite knows none; {hint}")
+    if "?" in url:
+        raise UsageError(f"the database URL of {name!r} has parameters, and SQLite's have none; a ? of a name is %3F")
+    if name in ("", ":memory:"):
+        raise UsageError(f"a database in memory is not supported, it needs a file; {_HINT}")
+    if "\0" in name:
+        raise UsageError(f"the name of the database has a NUL in it; {hint}")
+    return parsed.set(drivername="sqlite", database=os.path.expanduser(name))
 
 
 def safe_url(url: URL) -> str:
     """The URL for messages, without the password."""
+    if url.get_backend_name() == "sqlite":  # names of files may be no text, which URLs are
+        return "sqlite:///" + (url.database or "").replace("%", "%25").replace("?", "%3F")
     return join_hosts(url.render_as_string(hide_password=True), url)
 
 
@@ -83,17 +100,32 @@ def make_engine(url: str, *, read_timeout_s: int | None = None) -> Engine:
 
 
 def _sqlite_engine(url: URL) -> Engine:
-    engine = create_engine(url, connect_args={"timeout": BUSY_TIMEOUT_MS / 1000, "check_same_thread": False})
+    engine = create_engine(url)
+    path = sqlite_file.real_path(Path(url.database or ""))
+    opened: sqlite_file.FileState | None = None
+
+    @event.listens_for(engine, "do_connect")
+    def _connect(_dialect: Any, _record: Any, _arguments: Any, _parameters: Any) -> sqlite_file.FileConnection:
+        if opened is not None:
+            sqlite_file.check_same(path, opened)
+        return sqlite_file.connect(path, sqlite_file.opening_of(path), timeout_s=BUSY_TIMEOUT_MS / 1000)
 
     @event.listens_for(engine, "connect")
-    def _configure(connection: Any, _record: Any) -> None:
-        connection.isolation_level = None  # the driver's own BEGIN leaves DDL and reads outside of transactions
-        cursor = connection.cursor()
-        cursor.execute(f"PRAGMA busy_timeout = {BUSY_TIMEOUT_MS}")
-        cursor.execute("PRAGMA foreign_keys = ON")
-        cursor.execute("PRAGMA journal_mode = WAL")
-        cursor.execute("PRAGMA synchronous = NORMAL")
-        cursor.close()
+    def _configure(connection: sqlite_file.FileConnection, _record: Any) -> None:
+        nonlocal opened
+        connection.execute(f"PRAGMA busy_timeout = {BUSY_TIMEOUT_MS}")
+        connection.execute("PRAGMA foreign_keys = ON")
+        if connection.opening in (sqlite_file.Opening.CREATE, sqlite_file.Opening.WRITE):
+            connection.execute("PRAGMA journal_mode = WAL")
+            connection.execute("PRAGMA synchronous = NORMAL")
+        if connection.state is None:  # it was made by that
+            connection.state = sqlite_file.state_of(path)
+        opened = opened or connection.state
+
+    @event.listens_for(engine, "checkout")
+    def _lent(connection: sqlite_file.FileConnection, _record: Any, _proxy: Any) -> None:
+        if not connection.check():
+            raise DisconnectionError(f"{path} has changed")  # the pool opens it anew
 
     @event.listens_for(engine, "begin")
     def _begin(connection: Connection) -> None:

@@ -11,15 +11,17 @@ workers as whole tasks, by the same rules: `task_delay_s`.
 from __future__ import annotations
 
 import random
+import sqlite3
 import time
 from collections.abc import Callable
 from typing import TypeVar
 from weakref import WeakSet
 
 from sqlalchemy import Connection, Engine
-from sqlalchemy.exc import DBAPIError, IntegrityError, SQLAlchemyError
+from sqlalchemy.exc import DBAPIError, IntegrityError, OperationalError, SQLAlchemyError
 
 from semdb.database.engine import WRITE, safe_url
+from semdb.database.sqlite_file import FileConnection
 from semdb.errors import DatabaseError, DatabaseUnavailableError, RecordingUnavailableError
 
 T = TypeVar("T")
@@ -89,11 +91,23 @@ def _once(engine: Engine, work: Callable[[Connection], T], *, write: bool) -> T:
         _answered.add(engine)
         try:
             with connection.begin():
-                return work(connection)
+                found = work(connection)
+            _check_untorn(connection)
+            return found
         except DBAPIError as error:
+            _check_untorn(connection)
             if error_code(error) in _NOT_READY:  # another node, or this one later, over a new connection
                 connection.invalidate(error)
             raise
+
+
+def _check_untorn(connection: Connection) -> None:
+    """Raises the error of a busy file when one that was read without locks has been changed meanwhile."""
+    driver = connection.connection.driver_connection if not connection.invalidated else None
+    if isinstance(driver, FileConnection) and driver.is_torn():
+        reason = sqlite3.OperationalError(f"{driver.path} was changed while it was read")
+        reason.sqlite_errorname = "SQLITE_BUSY_SNAPSHOT"
+        raise OperationalError(None, None, reason)
 
 
 def task_delay_s(retries: int) -> float:
@@ -179,7 +193,9 @@ def _of_sqlite(name: str, setting: str) -> str | None:
     if name.startswith(("SQLITE_BUSY", "SQLITE_LOCKED")):
         return "is held by another process: wait for it or end it"
     if name.startswith("SQLITE_READONLY"):
-        return "cannot be written: check the rights of the file and its folder"
+        return "cannot be written: check the rights of the file, its folder and the files beside it, and its medium"
+    if name.startswith("SQLITE_IOERR"):
+        return "cannot be read or written as it has to be: check its disk (full, unplugged, a network share?)"
     return _NO_ROOM_ADVICE if name == "SQLITE_FULL" else None
 
 

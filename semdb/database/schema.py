@@ -10,6 +10,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from semdb.database import retry
 from semdb.database.engine import safe_url
+from semdb.database.tables import metadata
 from semdb.errors import SchemaError
 
 # Ascending; the last one is what this version of semdb reads and writes. A test compares them with the scripts.
@@ -49,9 +50,11 @@ def check_schema(engine: Engine) -> None:
 def upgrade(engine: Engine, revision: str = HEAD) -> None:
     """Create the schema, or move it up to `revision`; nothing happens when it is there already.
 
-    On SQLite all of it is one transaction. Raises SchemaError for a schema that is newer than this semdb.
+    On SQLite all of it is one transaction. Raises SchemaError for a schema that is newer than this semdb, or holds
+    tables of something else.
     """
     _refuse_unknown(engine)
+    _refuse_others(engine)
     _alembic(engine, "upgrade", revision)
 
 
@@ -65,6 +68,24 @@ def _refuse_unknown(engine: Engine) -> None:
     revision = current_revision(engine)
     if revision is not None and revision not in REVISIONS:
         check_schema(engine)
+
+
+def _refuse_others(engine: Engine) -> None:
+    """Raises SchemaError where no semdb is, and another program, or an upgrade that was cut off, left tables.
+
+    A SQLite file belongs to one program; a schema of a server may be shared as long as no name is there twice.
+    """
+    if current_revision(engine) is not None:
+        return
+    there = set(retry.read(engine, lambda connection: inspect(connection).get_table_names())) - {"alembic_version"}
+    in_the_way = there if engine.dialect.name == "sqlite" else there & set(metadata.tables)
+    if in_the_way:
+        few = ", ".join(sorted(in_the_way)[:5]) + (", ..." if len(in_the_way) > 5 else "")
+        what = "file" if engine.dialect.name == "sqlite" else "schema"
+        raise SchemaError(
+            f"{safe_url(engine.url)} is not empty and is no semdb database (tables {few}): give semdb a {what} of its "
+            "own, or drop the tables where an upgrade that was cut off left them"
+        )
 
 
 def _alembic(engine: Engine, command: str, revision: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from sqlalchemy import Connection, Engine, select
@@ -45,6 +46,7 @@ from semdb.database.records import (
     StoredKeyframe,
     WriteResult,
 )
+from semdb.database.sqlite_file import how_it_is_read
 from semdb.database.tables import maps, recordings
 from semdb.database.writing import KeyframeWriter
 from semdb.errors import NotFoundError, SchemaError
@@ -53,17 +55,19 @@ from semdb.types import BoolArray, Camera, Float32Array, FloatArray, Int64Array,
 Progress = Callable[[int, int], None]
 
 
-def open_store(url: str, *, create: bool = False) -> Store:
+def open_store(url: str, *, create: bool = False, say: Callable[[str], None] | None = None) -> Store:
     """The store at `url`, its schema checked.
 
-    With `create` a SQLite file that is missing or empty is made; a server always needs `semdb init`. Raises
-    UsageError for a URL of another kind, DatabaseError when it does not answer, SchemaError for a schema that is
-    missing, older or newer.
+    With `create` a SQLite file that is missing or empty is made; a server always needs `semdb init`. `say` takes a line
+    for people about a file that can only be read. Raises UsageError for a URL of another kind, DatabaseError when it
+    does not answer, SchemaError for a schema that is missing, older or newer.
     """
     parsed = parse_url(url)
     path = sqlite_path(parsed)
     if path is not None and not path.exists() and not create:
-        raise SchemaError(f"there is no database {safe_url(parsed)}: run `semdb init` or `semdb ingest` first")
+        raise SchemaError(_no_file(path, safe_url(parsed)))
+    if path is not None and say is not None and (line := how_it_is_read(path)) is not None:
+        say(line)
     engine = make_engine(url)
     try:
         if path is not None and create and schema.current_revision(engine) is None:
@@ -73,6 +77,12 @@ def open_store(url: str, *, create: bool = False) -> Store:
         engine.dispose()
         raise
     return Store(engine)
+
+
+def _no_file(path: Path, url: str) -> str:
+    other = Path("/") / path
+    hint = f"; {other} takes a fourth slash: sqlite:///{other}" if not path.is_absolute() and other.is_file() else ""
+    return f"there is no database {url}: run `semdb init` or `semdb ingest` first{hint}"
 
 
 class Store:

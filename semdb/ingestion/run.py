@@ -52,7 +52,7 @@ class IngestOptions:
 
     def map_of(self, recording: Recording) -> str:
         """The map that `recording` goes into."""
-        return self.map_name or default_map_name(recording)
+        return default_map_name(recording) if self.map_name is None else self.map_name
 
 
 @dataclass(slots=True)
