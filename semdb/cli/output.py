@@ -6,15 +6,18 @@ import csv
 import json
 import math
 import sys
+import textwrap
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from datetime import date, datetime, time, timedelta
 from decimal import Decimal
+from itertools import chain
 from typing import Any, TextIO
 
 from semdb.shown import for_json, for_terminal, number, width
 
 FORMATS = ("table", "csv", "json")
+MOST_HELD = 2**25  # characters of rows in memory, of statements that may give any number of them
 
 
 def to_jsonable(value: Any) -> Any:
@@ -67,8 +70,25 @@ def print_lines(*lines: str) -> None:
 def print_json(value: Any, stream: TextIO | None = None) -> None:
     """Print `value` as indented JSON with a newline at the end."""
     stream = stream or sys.stdout
-    stream.write(for_json(json.dumps(to_jsonable(value), indent=2, ensure_ascii=False, default=str)))
-    stream.write("\n")
+    stream.write(_json(value) + "\n")
+
+
+def _json(value: Any) -> str:
+    return for_json(json.dumps(to_jsonable(value), indent=2, ensure_ascii=False, default=str))
+
+
+def _print_json_array(values: Iterable[Any], stream: TextIO) -> None:
+    """As `print_json` of a list. Of very many values all but the first `MOST_HELD` are printed as they come."""
+    held: list[str] = []  # an error that comes with the first ones leaves stdout empty
+    size, before = 0, "[\n"
+    for value in values:
+        held.append(before + textwrap.indent(_json(value), "  "))
+        size, before = size + len(held[-1]), ",\n"
+        if size > MOST_HELD:
+            stream.writelines(held)
+            held.clear()
+    stream.writelines(held)
+    stream.write("[]\n" if before == "[\n" else "\n]\n")
 
 
 def cell_text(value: Any) -> str:
@@ -87,15 +107,25 @@ def cell_text(value: Any) -> str:
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], stream: TextIO | None = None) -> None:
-    """Print rows under their column names, numbers to the right. Nothing is cut, whatever the terminal's width."""
+    """Print rows under their column names, numbers to the right. Nothing is cut, whatever the terminal's width.
+
+    Of very many rows the first `MOST_HELD` make the widths, and the others are printed as they come.
+    """
     stream = stream or sys.stdout
-    rows = [tuple(row) for row in rows]
     heads = [for_terminal(name) for name in columns]
-    cells = [[cell_text(value) for value in row] for row in rows]
+    left = iter(rows)
+    cells: list[list[str]] = []
+    numbers, held = [True] * len(heads), 0
+    for row in left:
+        cells.append([cell_text(value) for value in row])
+        numbers = [right and _is_number(value) for right, value in zip(numbers, row, strict=True)]
+        held += sum(map(len, cells[-1])) + 100
+        if held > MOST_HELD:
+            break
     widths = [max([width(name), *(width(row[i]) for row in cells)]) for i, name in enumerate(heads)]
-    right = [bool(rows) and all(_is_number(row[i]) for row in rows) for i in range(len(heads))]
-    lines = [heads, ["-" * columns_wide for columns_wide in widths], *cells]
-    for line in lines:
+    right = [bool(cells) and is_number for is_number in numbers]
+    first = [heads, ["-" * columns_wide for columns_wide in widths], *cells]
+    for line in chain(first, ([cell_text(value) for value in row] for row in left)):
         padded = (_pad(text, w, r) for text, w, r in zip(line, widths, right, strict=True))
         stream.write("  ".join(padded).rstrip() + "\n")
 
@@ -157,6 +187,6 @@ def print_rows(
         print_csv(columns, rows, stream)
     elif fmt == "json":
         keys = distinct(columns)
-        print_json([dict(zip(keys, row, strict=True)) for row in rows], stream)
+        _print_json_array((dict(zip(keys, row, strict=True)) for row in rows), stream or sys.stdout)
     else:
         print_table(columns, rows, stream)

@@ -16,7 +16,8 @@ from sqlalchemy.engine import make_url
 from semdb.database import accounts, schema
 from semdb.database.catalogue import tables_and_columns
 from semdb.database.engine import make_engine
-from semdb.database.readonly import excess_rights, run_readonly
+from semdb.database.readonly import run_readonly
+from semdb.database.readonly_server import excess_rights
 from semdb.database.store import Store, open_store
 from semdb.database.tables import metadata
 from semdb.errors import DatabaseError, SchemaError, UsageError
@@ -129,7 +130,7 @@ def test_whatever_is_not_reading_is_refused(
     settings: Settings, store: Store, open_folder: Path, checked: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not checked:
-        monkeypatch.setattr("semdb.database.readonly._check_statement", lambda _: None)
+        monkeypatch.setattr("semdb.database.readonly._check_statement", lambda *_, **__: None)
     server = store.engine.dialect.name != "sqlite"
     before = _state(store)
     passed = set()

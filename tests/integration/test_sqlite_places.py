@@ -262,19 +262,19 @@ def test_files_of_other_programs_are_left_alone(tmp_path: Path) -> None:
     open_store(f"sqlite:///{empty}", create=True).close()
 
 
-def test_schemas_of_servers_may_be_shared_but_no_name(mariadb_url: str) -> None:
-    engine = make_engine(mariadb_url)
+def test_schemas_of_servers_may_be_shared_but_no_name(server_url: str) -> None:
+    engine = make_engine(server_url)
     with engine.connect() as connection:
         connection.exec_driver_sql("CREATE TABLE photos (id INTEGER PRIMARY KEY)")
         connection.exec_driver_sql("CREATE TABLE maps (id INTEGER PRIMARY KEY)")
-    code, _, err = semdb("init", "--database-url", mariadb_url)
+    code, _, err = semdb("init", "--database-url", server_url)
     assert code == 1
     assert "no semdb database (tables maps): give semdb a schema of its own" in err
     assert current_revision(engine) is None
     with engine.connect() as connection:
         connection.exec_driver_sql("DROP TABLE maps")
     engine.dispose()
-    assert semdb("init", "--database-url", mariadb_url)[0] == 0
+    assert semdb("init", "--database-url", server_url)[0] == 0
 
 
 def test_how_it_is_read(file: Path, folder: Path) -> None:

@@ -6,6 +6,7 @@ import sqlite3
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 Entries = Sequence[tuple[str, str]]
 Given = Mapping[str, str]
@@ -78,7 +79,7 @@ def _recordings_or_folders(given: Given, environment: Environment) -> tuple[Entr
 def _names(query: str, given: Given, environment: Environment) -> Entries:
     """(name, what it is) from a SQLite file, as it is at the moment; none from a server, which may be slow."""
     url = given.get("--database-url") or environment.get("SEMDB_DATABASE_URL") or "sqlite:///semdb.sqlite3"
-    path = Path(url.removeprefix("sqlite:///").partition("?")[0])
+    path = Path(unquote(url.removeprefix("sqlite:///"))).expanduser()
     if not url.startswith("sqlite:///") or not path.is_file():
         return ()
     # a reader of a file that nobody has open leaves nothing beside it
