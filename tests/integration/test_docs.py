@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -60,7 +61,10 @@ def shell_blocks(path: Path) -> list[str]:
     ]
 
 
-DOCUMENTS = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
+DOCUMENTS = [
+    *(REPOSITORY / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
+    *sorted((REPOSITORY / "docs").glob("*.md")),
+]
 WITH_COMMANDS = [path for path in DOCUMENTS if shell_blocks(path)]
 
 
@@ -128,6 +132,16 @@ def test_the_program_of_the_readme_works(workplace: Path) -> None:
     done = run("python program.py", workplace, **models)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("localized [[")
+
+
+def test_what_the_page_on_sensors_writes_is_a_recording(tmp_path: Path) -> None:
+    [program] = blocks(REPOSITORY / "docs" / "sensors.md", ("python",))
+    done = run(f"python - <<'EOF'\n{program}\nEOF\nsemdb recording my_room --json", tmp_path)
+    assert done.returncode == 0, done.stderr
+    [seen] = json.loads(done.stdout)
+    assert (seen["format"], seen["frames"], seen["triples"], seen["depth_scale"]) == ("tum", 5, 5, 1000)
+    assert seen["trajectory_length_m"] == pytest.approx(0.04)
+    assert not [line for line in seen["notes"] if "assumed" in line]
 
 
 def test_the_documents_name_commands_to_run() -> None:

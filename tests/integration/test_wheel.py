@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-SOURCES = ("pyproject.toml", "README.md", "LICENSE", "semdb", "migrations", "workers")
+SOURCES = ("pyproject.toml", "setup.py", "README.md", "LICENSE", "semdb", "migrations", "workers")
 
 
 def run(*command: str | Path, cwd: Path, env: dict[str, str] | None = None) -> str:
@@ -101,3 +101,11 @@ def test_the_worker_application_is_importable(clean_python: Path, environment: d
     )
     found = run(clean_python, "-c", code, cwd=tmp_path, env=environment).strip()
     assert found == "['semdb.ingest_items', 'semdb.ingest_recording']"
+
+
+def test_an_older_python_is_told_which_one_is_needed() -> None:
+    """Not by the name of the first dependency that has no version for it."""
+    code = "import sys; sys.version_info = (3, 10, 13); sys.version = '3.10.13 (main)'; exec(open('setup.py').read())"
+    done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.startswith("semdb needs Python 3.11 or newer, and this is 3.10.13: docs/install.md")
