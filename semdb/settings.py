@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 from urllib.parse import urlsplit
 
-from pydantic import Field, field_validator
+from pydantic import Field, ValidationError, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from semdb.errors import UsageError
@@ -96,3 +97,22 @@ class Settings(BaseSettings):
     @classmethod
     def _broker_url(cls, url: str) -> str:
         return check_broker_url(url)
+
+
+def settings_with(given: Mapping[str, object], option: Callable[[str], str] = "{}=".format) -> Settings:
+    """The settings of the environment under those that are `given` by name.
+
+    Raises UsageError naming the variable, or the `option` that a name was given as.
+    """
+    unknown = sorted(set(given) - set(Settings.model_fields))
+    if unknown:
+        raise UsageError(f"there is no setting {unknown[0]!r}; settings are {', '.join(Settings.model_fields)}")
+    try:
+        return Settings(**given)  # type: ignore[arg-type]
+    except ValidationError as error:
+        problems = []
+        for detail in error.errors():
+            name = str(detail["loc"][0]) if detail["loc"] else ""
+            where = option(name) if name in given else f"SEMDB_{name.upper()}="
+            problems.append(f"{where}{detail['input']}: {detail['msg']}")
+        raise UsageError("; ".join(problems)) from None

@@ -11,8 +11,8 @@ from semdb.cli.options import CameraOption, JsonFlag, Overrides, settings_option
 from semdb.shown import measure
 
 if TYPE_CHECKING:
+    from semdb.api import Answer
     from semdb.errors import FrameError
-    from semdb.localization.images import ImageLocalization
 
 
 @settings_options(models=True)
@@ -41,14 +41,11 @@ def command(
 
     An image that cannot be read is named on stderr and makes the exit code 1; the others are localized all the same.
     """
+    from semdb.api import Database
     from semdb.cli.output import print_json, print_lines
     from semdb.cli.progress import say
-    from semdb.database.store import open_store
-    from semdb.localization.images import LocalizeOptions, localize_images
-    from semdb.recordings import parse_camera
 
     settings = overrides.settings()
-    options = LocalizeOptions(map_name, None if camera is None else parse_camera(camera), like, coarse)
     if plot is not None:
         plot.mkdir(parents=True, exist_ok=True)
     results: list[dict[str, Any]] = []
@@ -59,79 +56,43 @@ def command(
         broken.append(error)
         say(str(error))
 
-    with open_store(settings.database_url, say=say) as store:
-        for answer in localize_images(images, depth or [], store, settings, options, say=say, unreadable=unreadable):
+    with Database(settings, say=say) as database:
+        for answer in database.localize_each(
+            images, map=map_name, depth=depth, camera=camera, like=like, coarse=coarse, unreadable=unreadable
+        ):
             if json:
-                results.append(as_json(answer))
+                results.append(answer.as_dict())
             else:
                 print_lines(*as_lines(answer))
             if plot is not None:
-                from semdb.pictures.localization import write_picture
+                from semdb.pictures.localization import picture_path
 
-                say(f"wrote {write_picture(plot, store, answer, pictures)}")
+                say(f"wrote {answer.save(picture_path(plot, answer.image, pictures))}")
     if json:
         print_json(results)
     if broken:
         raise typer.Exit(1)
 
 
-def as_json(answer: ImageLocalization) -> dict[str, Any]:
-    """One object of the array that `--json` prints."""
-    from semdb.geometry import quat_wxyz_from_rotation
-
-    found = answer.localization
-    pose = found.world_from_camera
-    return {
-        "image": str(answer.query.path),
-        "verdict": str(found.verdict),
-        "map": found.map_name,
-        "pose": None
-        if pose is None
-        else {"position": pose[:3, 3].tolist(), "quat_wxyz": quat_wxyz_from_rotation(pose[:3, :3]).tolist()},
-        "covariance": None if found.covariance is None else found.covariance.tolist(),
-        "confidence": found.confidence,
-        "inliers": found.inliers,
-        "stage": found.stage,
-        "reason": found.reason,
-        "ranked_share": found.ranked_share,
-        "keyframes_matched": found.keyframes_matched,
-        "candidates": [
-            {
-                "keyframe": candidate.keyframe_id,
-                "recording": candidate.recording,
-                "frame_index": candidate.frame_index,
-                "class_score": candidate.class_score,
-                "cosine": candidate.cosine,
-                "inliers": candidate.inliers,
-            }
-            for candidate in found.candidates
-        ],
-        "refinements": dict(found.refinements),
-        "timing_ms": dict(found.timing_ms),
-    }
-
-
-def as_lines(answer: ImageLocalization) -> list[str]:
+def as_lines(answer: Answer) -> list[str]:
     """What is printed for people."""
-    from semdb.geometry import quat_wxyz_from_rotation
-
-    found = answer.localization
+    confidence = measure(answer.confidence, 2, unless=(0.0, 1.0))
     lines = [
-        f"{answer.query.path}",
-        f"  verdict     {found.verdict} (confidence {measure(found.confidence, 2, unless=(0.0, 1.0))}): {found.reason}",
+        f"{answer.image}",
+        f"  verdict     {answer.verdict} (confidence {confidence}): {answer.reason}",
     ]
-    if found.world_from_camera is not None:
-        position = " ".join(f"{value:.4f}" for value in found.world_from_camera[:3, 3])
-        quaternion = " ".join(f"{value:.5f}" for value in quat_wxyz_from_rotation(found.world_from_camera[:3, :3]))
+    if answer.position is not None and answer.quat_wxyz is not None:
+        position = " ".join(f"{value:.4f}" for value in answer.position)
+        quaternion = " ".join(f"{value:.5f}" for value in answer.quat_wxyz)
         lines += [
-            f"  position    {position} m in map {found.map_name}{_sigma(found.covariance)}",
+            f"  position    {position} m in map {answer.map}{_sigma(answer.covariance)}",
             f"  quat_wxyz   {quaternion}",
         ]
-    named = [f"{c.recording}/{c.frame_index} ({c.inliers})" for c in found.candidates]
-    spent = ", ".join(f"{stage} {value:.0f}" for stage, value in found.timing_ms.items())
+    named = [f"{c.recording}/{c.frame_index} ({c.inliers})" for c in answer.candidates]
+    spent = ", ".join(f"{stage} {value:.0f}" for stage, value in answer.timing_ms.items())
     return [
         *lines,
-        f"  candidates  {', '.join(named) or 'none'} (inliers), stage {found.stage}",
+        f"  candidates  {', '.join(named) or 'none'} (inliers), stage {answer.stage}",
         f"  ms          {spent}",
     ]
 

@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, cast
 
 import typer
 
-from semdb.errors import UsageError
-
 if TYPE_CHECKING:
     from semdb.recordings.options import ReadOptions
     from semdb.settings import Settings
@@ -119,19 +117,9 @@ class Overrides:
 
 def load_settings(**given: object) -> Settings:
     """`Settings` from the environment and `given`. Raises `UsageError` naming what is wrong where."""
-    from pydantic import ValidationError
+    from semdb.settings import settings_with
 
-    from semdb.settings import Settings
-
-    try:
-        return Settings(**given)  # type: ignore[arg-type]
-    except ValidationError as error:
-        problems = []
-        for detail in error.errors():
-            name = str(detail["loc"][0]) if detail["loc"] else ""
-            where = f"--{name.replace('_', '-')}" if name in given else f"SEMDB_{name.upper()}"
-            problems.append(f"{where}={detail['input']}: {detail['msg']}")
-        raise UsageError("; ".join(problems)) from None
+    return settings_with(given, lambda name: f"--{name.replace('_', '-')}=")
 
 
 _DATABASE = {"database_url": DatabaseUrl}

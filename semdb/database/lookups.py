@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from sqlalchemy import Connection, Engine, select
+from sqlalchemy import Connection, Engine, exists, select
 
 from semdb.database import retry
 from semdb.database.reading import camera_from_row
+from semdb.database.records import MapHead
 from semdb.database.tables import (
     cameras,
     categories,
@@ -13,11 +14,38 @@ from semdb.database.tables import (
     keyframe_categories,
     keyframe_images,
     keyframes,
+    map_models,
     maps,
+    models,
     recordings,
+    refinements,
 )
 from semdb.errors import NotFoundError
-from semdb.types import Camera
+from semdb.types import Camera, ModelInfo
+
+
+def map_heads(engine: Engine) -> list[MapHead]:
+    """All maps by id, with what a query must be made with: three small queries, whatever the maps hold."""
+    holds = exists().where(keyframes.c.recording_id == recordings.c.id, recordings.c.map_id == maps.c.id)
+    heads = select(maps.c.id, maps.c.name, holds).order_by(maps.c.id)
+    m, r = models.c, refinements.c
+    made_by = select(map_models.c.map_id, m.role, m.name, m.sha256, m.config)
+    made_by = made_by.join(models, m.id == map_models.c.model_id).order_by(map_models.c.map_id, m.role)
+    steps = select(r.map_id, r.kind, r.map_state, r.parameters, r.computed_at, r.row_count).order_by(r.map_id, r.kind)
+
+    def work(connection: Connection) -> list[MapHead]:
+        infos: dict[int, list[ModelInfo]] = {}
+        for map_id, *info in connection.execute(made_by):
+            infos.setdefault(map_id, []).append(ModelInfo(*info))
+        refined: dict[int, list[str]] = {}
+        for map_id, *step in connection.execute(steps):
+            refined.setdefault(map_id, []).append(" ".join(map(str, step)))
+        return [
+            MapHead(int(key), name, tuple(infos.get(key, ())), tuple(refined.get(key, ())), bool(there))
+            for key, name, there in connection.execute(heads)
+        ]
+
+    return retry.read(engine, work)
 
 
 def planned_frames(engine: Engine, map_name: str, recording: str) -> tuple[int, ...]:

@@ -11,7 +11,7 @@ from sqlalchemy import Connection, Engine, Select, select
 
 from semdb.database import retry
 from semdb.database.codecs import decode_array, decode_keypoints, decode_mask, decode_vectors, keypoint_rows
-from semdb.database.records import StoredImage, StoredKeyframe, StoredObject
+from semdb.database.records import KeyframeHead, StoredImage, StoredKeyframe, StoredObject
 from semdb.database.tables import (
     cameras,
     categories,
@@ -20,6 +20,7 @@ from semdb.database.tables import (
     keyframe_images,
     keyframes,
     keypoints,
+    maps,
     object_features,
     objects,
     recordings,
@@ -209,6 +210,60 @@ def _object(row: Any) -> StoredObject:
         box=np.array([row.x1, row.y1, row.x2, row.y2], dtype=np.float32),
         geometry=ObjectGeometry(row.pixel_area, triple("centroid"), triple("extent")),
     )
+
+
+def keyframe_heads(
+    engine: Engine,
+    *,
+    keys: Sequence[int] | None = None,
+    map_id: int | None = None,
+    recording_id: int | None = None,
+    after: int = 0,
+    limit: int | None = None,
+) -> list[KeyframeHead]:
+    """Keyframes without what is large, by ascending id: those of `keys`, or of a map or recording, after an id.
+
+    Raises NotFoundError for one of `keys` that is not there.
+    """
+    k, r = keyframes.c, recordings.c
+    query = (
+        select(
+            *(column for column in k),
+            *(column for column in cameras.c if column.name not in ("id", "digest")),
+            r.name.label("recording"),
+            maps.c.name.label("map"),
+        )
+        .join(cameras, cameras.c.id == k.camera_id)
+        .join(recordings, r.id == k.recording_id)
+        .join(maps, maps.c.id == r.map_id)
+        .where(k.id > after)
+        .order_by(k.id)
+    )
+    if map_id is not None:
+        query = query.where(r.map_id == map_id)
+    if recording_id is not None:
+        query = query.where(k.recording_id == recording_id)
+
+    def work(connection: Connection) -> list[Any]:
+        if keys is None:
+            return list(connection.execute(query.limit(limit)))
+        return list(_chunked(connection, _ints(keys), lambda chunk: query.where(k.id.in_(chunk))))
+
+    rows = retry.read(engine, work)
+    if keys is not None:
+        _missing(_ints(keys), {row.id for row in rows}, "keyframe")
+    return [
+        KeyframeHead(
+            id=row.id,
+            map=row.map,
+            recording=row.recording,
+            frame_index=row.frame_index,
+            timestamp_ns=row.timestamp_ns,
+            camera=camera_from_row(row),
+            world_from_camera=_pose(row),
+        )
+        for row in rows
+    ]
 
 
 def load_image(engine: Engine, keyframe_id: int) -> StoredImage:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from enum import StrEnum
 from typing import Any
 
-from semdb.types import Camera, Description, Float32Array, FloatArray, Keypoints, ObjectGeometry
+from semdb.types import Camera, Description, Float32Array, FloatArray, Keypoints, ModelInfo, ObjectGeometry
 
 
 class RecordingState(StrEnum):
@@ -38,6 +38,20 @@ class MapInfo:
     name: str
     keyframes: int
     recordings: int
+
+
+@dataclass(frozen=True, slots=True)
+class MapHead:
+    """What a program that keeps a map in memory looks at before each query: equal heads, the same models and steps.
+
+    What happens to the keyframes is not in it; `refined` has a line for each step of `semdb refine` that was run.
+    """
+
+    id: int
+    name: str
+    models: tuple[ModelInfo, ...]
+    refined: tuple[str, ...]
+    holds_keyframes: bool = field(compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,6 +152,19 @@ class StoredKeyframe:
     world_from_camera: FloatArray  # [4, 4]
     objects: tuple[StoredObject, ...]  # by ordinal
     keypoints: Keypoints
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframeHead:
+    """A keyframe without what is large."""
+
+    id: int
+    map: str
+    recording: str
+    frame_index: int
+    timestamp_ns: int | None
+    camera: Camera
+    world_from_camera: FloatArray  # [4, 4]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -32,8 +32,10 @@ from semdb.database.records import (
     ClassConfusion,
     Deleted,
     FailedItem,
+    KeyframeHead,
     KeyframeRecord,
     ListedKeyframe,
+    MapHead,
     MapInfo,
     MapObject,
     PlannedRecording,
@@ -116,6 +118,10 @@ class Store:
     def maps(self) -> list[MapInfo]:
         """All maps by id."""
         return planning.list_maps(self.engine)
+
+    def map_heads(self) -> list[MapHead]:
+        """All maps by id, with what a query must be made with, at the price of three small queries."""
+        return lookups.map_heads(self.engine)
 
     def find_map(self, name: str) -> MapInfo:
         """The map `name`. Raises NotFoundError, which names the maps there are."""
@@ -209,6 +215,16 @@ class Store:
     def load_keyframes(self, keyframe_ids: Sequence[int], *, descriptors: bool = True) -> list[StoredKeyframe]:
         """Keyframes in the order of `keyframe_ids`. Raises NotFoundError, CodecError."""
         return reading.load_keyframes(self.engine, keyframe_ids, with_descriptors=descriptors)
+
+    def keyframe_heads(
+        self, map_id: int, recording_id: int | None = None, *, after: int = 0, limit: int | None = None
+    ) -> list[KeyframeHead]:
+        """Keyframes of a map, or of a recording of it, without what is large, by ascending id, those after an id."""
+        return reading.keyframe_heads(self.engine, map_id=map_id, recording_id=recording_id, after=after, limit=limit)
+
+    def keyframe_heads_of(self, keyframe_ids: Sequence[int]) -> list[KeyframeHead]:
+        """These keyframes without what is large, by ascending id. Raises NotFoundError for one that is not there."""
+        return reading.keyframe_heads(self.engine, keys=keyframe_ids)
 
     def load_image(self, keyframe_id: int) -> StoredImage:
         """The colour and depth files of a keyframe as recorded. Raises NotFoundError."""

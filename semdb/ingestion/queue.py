@@ -8,6 +8,7 @@ that nothing names. Nothing here knows how messages travel: `send` is given.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 
 from semdb.database import items
@@ -46,28 +47,31 @@ def queue_recordings(
     options: IngestOptions,
     send: Send,
     *,
+    store: Store | None = None,
     progress: Progress | None = None,
     say: Callable[[str], None] | None = None,
 ) -> list[IngestSummary]:
     """Plans every recording under `paths` and sends its keyframes; nothing is described here.
 
-    Raises as `ingest_recordings` does, and what `send` raises: then the plan is in the database and `sweep` sends it.
+    Without `store` that of the settings is opened. Raises as `ingest_recordings` does, and what `send` raises: then the
+    plan is in the database and `sweep` sends it.
     """
     summaries = []
-    with open_store(settings.database_url, create=True) as store:
+    opening = open_store(settings.database_url, create=True) if store is None else nullcontext(store)
+    with opening as opened:
         for recording in open_all(paths, settings, options):
-            known = map_models_of(store, options.map_of(recording))
+            known = map_models_of(opened, options.map_of(recording))
             specs = specs_for_ingest(settings, known, has_masks=recording.categories is not None)
             for note in (*recording.said, *specs.notes):
                 if say is not None:
                     say(f"{recording.name}: {note}")
             one = settings_of_map(settings, known).model_copy(update={"threads": 1})
             models = make_describers(specs, one)[0].models
-            summary, _ = plan_ingest(recording, store, models, options, progress=progress)
+            summary, _ = plan_ingest(recording, opened, models, options, progress=progress)
             summary.notes = (*recording.said, *specs.notes)
-            requeue_failed(store.engine, summary.recording_id)
-            sweep(store, send, recording_id=summary.recording_id)
-            store.finish_recording(summary.recording_id)
+            requeue_failed(opened.engine, summary.recording_id)
+            sweep(opened, send, recording_id=summary.recording_id)
+            opened.finish_recording(summary.recording_id)
             summaries.append(summary)
     return summaries
 

@@ -30,6 +30,7 @@ from semdb.settings import Settings
 from semdb.types import ModelInfo
 
 Progress = Callable[[str, int, int], None]  # what, done, total
+Describers = dict[object, list[Describer]]  # by all that makes them what they are
 MOST_DESCRIBERS = 4  # each holds networks of its own
 SECONDS_BETWEEN_LOOKS = 0.5  # at what other workers still have
 
@@ -94,24 +95,54 @@ def ingest_recordings(
     `say` takes lines for people (what was chosen where nothing was set). Raises RecordingError for a path that
     cannot be used at all, UsageError when the models or the plan contradict what is stored, DatabaseError.
     """
-    options = replace(options or IngestOptions(), descriptor_dtype=settings.descriptor_dtype)
+    options = options or IngestOptions()
     recordings = open_all(paths, settings, options)
-    describers: dict[object, list[Describer]] = {}
-    summaries: list[IngestSummary] = []
     with open_store(settings.database_url, create=True) as store:
-        for recording in recordings:
-            map_models = map_models_of(store, options.map_of(recording))
-            specs = specs_for_ingest(settings, map_models, has_masks=recording.categories is not None)
-            for note in (*recording.said, *specs.notes):
-                (say or _nobody)(f"{recording.name}: {note}")
-            own = settings_of_map(settings, map_models)
-            key = (specs, own.score_threshold, own.max_keypoints, own.classes, own.dynamic)
-            if key not in describers:
-                describers[key] = make_describers(specs, own)
-            summary = ingest_recording(recording, store, describers[key], options, progress=progress)
-            summary.notes = (*recording.said, *specs.notes)
-            summaries.append(summary)
+        return ingest_opened(recordings, store, settings, options, progress=progress, say=say)
+
+
+def ingest_opened(
+    recordings: Sequence[Recording],
+    store: Store,
+    settings: Settings,
+    options: IngestOptions,
+    *,
+    describers: Describers | None = None,
+    progress: Progress | None = None,
+    say: Callable[[str], None] | None = None,
+) -> list[IngestSummary]:
+    """Ingests open recordings into `store`; one summary each, in order. Raises what `ingest_recordings` raises.
+
+    `describers` keeps networks for the next call, which must not be made meanwhile.
+    """
+    options = replace(options, descriptor_dtype=settings.descriptor_dtype)
+    describers = {} if describers is None else describers
+    summaries: list[IngestSummary] = []
+    for recording in recordings:
+        has_masks = recording.categories is not None
+        specs, own = describers_for(options.map_of(recording), has_masks, store, settings, describers)
+        for note in (*recording.said, *specs.notes):
+            (say or _nobody)(f"{recording.name}: {note}")
+        summary = ingest_recording(recording, store, own, options, progress=progress)
+        summary.notes = (*recording.said, *specs.notes)
+        summaries.append(summary)
     return summaries
+
+
+def describers_for(
+    map_name: str, has_masks: bool, store: Store, settings: Settings, known: Describers
+) -> tuple[ModelSpecs, list[Describer]]:
+    """What describes a recording of a map, from `known` where it is there, which it is added to.
+
+    Raises UsageError where no detector is at hand, ModelError.
+    """
+    map_models = map_models_of(store, map_name)
+    specs = specs_for_ingest(settings, map_models, has_masks=has_masks)
+    own = settings_of_map(settings, map_models)
+    key = (specs, own.score_threshold, own.max_keypoints, own.classes, own.dynamic)
+    if key not in known:
+        known[key] = make_describers(specs, own)
+    return specs, known[key]
 
 
 def open_all(paths: Sequence[Path | str], settings: Settings, options: IngestOptions) -> list[Recording]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from bisect import bisect_left
 from collections import OrderedDict
 from collections.abc import Collection, Sequence
@@ -26,11 +27,13 @@ USED, STALE, NONE, OFF = "used", "stale", "none", "off"  # what becomes of its p
 class KeyframeCache:
     """Loads keyframes from the database and keeps the `capacity` last used (about 1.3 MiB each).
 
-    With `refined` their points are those of `semdb refine`, as long as these belong to what the map holds.
+    With `refined` their points are those of `semdb refine`, as long as these belong to what the map holds. Threads may
+    share it: they take turns.
     """
 
     def __init__(self, store: Store, map_id: int, capacity: int = 64, *, refined: bool = True) -> None:
         self.numbers = ClassNumbers()
+        self._turn = threading.RLock()
         self._store = store
         self._map_id = map_id
         self._capacity = capacity
@@ -44,13 +47,18 @@ class KeyframeCache:
     @property
     def points(self) -> str:
         """What becomes of refined points: ``used``, ``stale`` (the map has changed since), ``none`` or ``off``."""
-        if self._points is None:
-            known = [item for item in self._store.refinements(self._map_id) if item.kind == POINTS]
-            self._points = NONE if not known else USED if known[0].current else STALE
-        return self._points
+        with self._turn:
+            if self._points is None:
+                known = [item for item in self._store.refinements(self._map_id) if item.kind == POINTS]
+                self._points = NONE if not known else USED if known[0].current else STALE
+            return self._points
 
     def forget(self, change: MapChange) -> None:
         """Drops what is out of date; poses of added keyframes are read when they are asked for."""
+        with self._turn:
+            self._forget(change)
+
+    def _forget(self, change: MapChange) -> None:
         if self._refined:
             if self._points == USED:
                 self._views.clear()  # their points belong to the map as it was
@@ -68,16 +76,17 @@ class KeyframeCache:
 
     def views(self, keyframe_ids: Sequence[int]) -> list[KeyframeView]:
         """Views in the order of `keyframe_ids`; a keyframe deleted meanwhile is left out."""
-        self._load([i for i in keyframe_ids if i not in self._views])
-        found = []
-        for keyframe_id in keyframe_ids:
-            view = self._views.get(keyframe_id)
-            if view is not None:
-                self._views.move_to_end(keyframe_id)
-                found.append(view)
-        while len(self._views) > self._capacity:
-            self._views.popitem(last=False)
-        return found
+        with self._turn:
+            self._load([i for i in keyframe_ids if i not in self._views])
+            found = []
+            for keyframe_id in keyframe_ids:
+                view = self._views.get(keyframe_id)
+                if view is not None:
+                    self._views.move_to_end(keyframe_id)
+                    found.append(view)
+            while len(self._views) > self._capacity:
+                self._views.popitem(last=False)
+            return found
 
     def _load(self, missing: Sequence[int]) -> None:
         if not missing:
@@ -143,6 +152,10 @@ class KeyframeCache:
 
     def poses(self) -> tuple[list[int], FloatArray]:
         """Ids, ascending, and ``world_from_camera`` ``[n, 4, 4]`` of all keyframes of the map."""
+        with self._turn:
+            return self._read_poses()
+
+    def _read_poses(self) -> tuple[list[int], FloatArray]:
         if self._poses is None:
             self._poses = self._store.poses(self._map_id)
         elif self._stale:

@@ -81,7 +81,8 @@ class _Search:
 class Localizer:
     """Localizes descriptions in one map.
 
-    Not thread-safe: use one per thread. `source` answers the coarse step, `cache` loads keyframes.
+    `source` answers the coarse step, `cache` loads keyframes. Threads may share it where they may share the source
+    (`SharedSource`).
     """
 
     def __init__(

@@ -15,7 +15,7 @@ from semdb.types import Float32Array, FloatArray, Int64Array
 
 
 class SqlSource:
-    """Asks the database for every query."""
+    """Asks the database for every query. Threads may share it where one of them at a time refreshes it."""
 
     def __init__(self, store: Store, map_id: int) -> None:
         self._store = store
@@ -42,11 +42,12 @@ class SqlSource:
         return self._count or 0
 
     def document_frequencies(self, categories: Collection[str]) -> dict[str, int]:
-        unknown = [name for name in categories if name not in self._frequencies]
+        known = self._frequencies  # another thread's refresh puts another one in its place
+        unknown = [name for name in categories if name not in known]
         if unknown:
             found = self._store.document_frequencies(self._map_id, unknown)
-            self._frequencies.update((name, found.get(name, 0)) for name in unknown)
-        return {name: self._frequencies[name] for name in categories}
+            known.update((name, found.get(name, 0)) for name in unknown)
+        return {name: known[name] for name in categories}
 
     def filtered(self, query: ClassQuery, minimum_share: float, at_most: int | None) -> Scored:
         found = self._store.class_filter(self._map_id, query, minimum_share, at_most)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -58,13 +59,15 @@ class KeyframeView:
 
 
 class ClassNumbers:
-    """Numbers class names in the order in which they are first asked for."""
+    """Numbers class names in the order in which they are first asked for, by any thread."""
 
     def __init__(self) -> None:
         self._numbers: dict[str, int] = {}
+        self._next = itertools.count()
 
     def of(self, name: str) -> int:
-        return self._numbers.setdefault(name, len(self._numbers))
+        known = self._numbers.get(name)
+        return self._numbers.setdefault(name, next(self._next)) if known is None else known
 
 
 def make_view(

@@ -154,6 +154,24 @@ def draw_localization(
     return figure_to_image(figure)
 
 
+def draw_image(image: ImageArray, detections: Sequence[Detection], *, title: str) -> ImageArray:
+    """One image with object masks, class names and scores under a `title`, RGB ``[H, W, 3]``.
+
+    `image` is RGB ``[H, W, 3]`` of any size; it is drawn 720 pixels high.
+    """
+    colours = category_colours(detection.category for detection in detections)
+    pane = _pane_for(image, MARGIN)
+    width, height = pane.width + 2 * MARGIN, HEADER + PANE_HEIGHT + MARGIN
+    sheet = np.full((height, width, 3), 255, np.uint8)
+    _paste(sheet, pane, image, detections, colours)
+    figure, axes = blank_figure(width, height)
+    axes.imshow(sheet, extent=(0, width, height, 0), interpolation="nearest", aspect="auto", zorder=0)
+    _draw_labels(axes, pane, detections, colours)
+    head = axes.text(MARGIN, HEADER / 2, for_plot(title), color=INK, fontsize=15, weight="bold", va="center")
+    _fit(head, width - 2 * MARGIN)
+    return figure_to_image(figure)
+
+
 def localization_facts(localization: Localization, error: tuple[float, float] | None = None) -> list[tuple[str, str]]:
     """What the caption of a picture says: position, rotation, inliers, confidence, and the error where it is known.
 

@@ -5,53 +5,48 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from semdb.database.store import Store
 from semdb.geometry import pose_error, transform_points
-from semdb.localization.images import ImageLocalization
+from semdb.localization.query_image import QueryImage
 from semdb.pictures.drawing import category_colours, combine_pictures, draw_localization, localization_facts
 from semdb.pictures.top_view import MapObject, draw_top_view
 from semdb.recordings import decode_color
 from semdb.types import Detection, ImageArray, Localization
 
 
-def write_picture(directory: Path, store: Store, answer: ImageLocalization, taken: set[Path]) -> Path:
-    """Writes ``DIR/<image name>.png`` and returns its path. Names in `taken` are numbered on, and it is added."""
-    picture = draw_picture(store, answer)
-    stem = answer.query.path.stem
+def picture_path(directory: Path, name: str, taken: set[Path]) -> Path:
+    """``DIR/<image name>.png`` for the image of that `name`. Names in `taken` are numbered on, and it is added."""
+    stem = Path(name).stem
     path, number = directory / f"{stem}.png", 1
     while path in taken:
         number += 1
         path = directory / f"{stem}-{number}.png"
     taken.add(path)
-    encoded = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1]
-    path.write_bytes(encoded.tobytes())
     return path
 
 
-def draw_picture(store: Store, answer: ImageLocalization) -> ImageArray:
-    """Query and best keyframe side by side over the map from above, RGB ``[H, W, 3]``."""
-    found, query = answer.localization, answer.query
+def draw_picture(store: Store, query: QueryImage, seen: Sequence[Detection], found: Localization) -> ImageArray:
+    """Query with what was `seen` in it and best keyframe side by side, over the map from above, RGB ``[H, W, 3]``."""
     error = None
     if found.world_from_camera is not None and query.world_from_camera is not None:
         error = pose_error(found.world_from_camera, query.world_from_camera)
     image, detections, label = _keyframe(store, found)
     matches = draw_localization(
         query.image,
-        answer.description.detections,
+        seen,
         image,
         detections,
         found.query_xy,
         found.keyframe_xy,
-        title=query.path.name,
+        title=Path(query.name).name,
         verdict=found.verdict,
         facts=localization_facts(found, error),
         keyframe_label=label,
     )
-    classes = [thing.category for thing in (*answer.description.detections, *detections)]
-    return combine_pictures([matches, _top_view(store, answer, classes)])
+    classes = [thing.category for thing in (*seen, *detections)]
+    return combine_pictures([matches, _top_view(store, query, found, classes)])
 
 
 def _keyframe(store: Store, found: Localization) -> tuple[ImageArray | None, tuple[Detection, ...], str]:
@@ -68,8 +63,7 @@ def _keyframe(store: Store, found: Localization) -> tuple[ImageArray | None, tup
     return image, detections, f"best keyframe: {stored.recording}, frame {stored.frame_index}"
 
 
-def _top_view(store: Store, answer: ImageLocalization, classes: Sequence[str]) -> ImageArray:
-    found = answer.localization
+def _top_view(store: Store, query: QueryImage, found: Localization, classes: Sequence[str]) -> ImageArray:
     info = store.find_map(found.map_name)
     ids, poses = store.poses(info.id)
     objects = []
@@ -86,6 +80,6 @@ def _top_view(store: Store, answer: ImageLocalization, classes: Sequence[str]) -
         verdict=found.verdict,
         colours=category_colours(classes),
         objects=objects,
-        true_pose=answer.query.world_from_camera,
+        true_pose=query.world_from_camera,
         candidates=[position for position, keyframe_id in enumerate(ids) if keyframe_id in matched],
     )

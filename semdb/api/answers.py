@@ -1,0 +1,120 @@
+"""From what the rooms behind give to the values that programs get."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from semdb.database.records import KeyframeHead
+from semdb.database.store import Store
+from semdb.door.values import Answer, Keyframe, KeyframeContent, SeenObject, frozen
+from semdb.types import Camera, Float32Array, ImageArray, Keypoints
+
+if TYPE_CHECKING:
+    from semdb.localization.images import ImageLocalization
+
+
+def answer_of(found: ImageLocalization, store: Callable[[], Store]) -> Answer:
+    """The answer for one image; `store` is asked for what its picture shows of the database."""
+    query, localization = found.query, found.localization
+    pose = localization.world_from_camera
+    objects = tuple(
+        SeenObject.of(
+            thing.category,
+            thing.score,
+            thing.box,
+            thing.mask,
+            centroid=shape.centroid,
+            extent=shape.extent,
+            world_from_camera=pose,
+        )
+        for thing, shape in zip(found.description.detections, found.description.geometry, strict=True)
+    )
+    shown = replace(query, depth=None, instances=None)  # nothing large is kept but the image
+
+    def draw() -> ImageArray:
+        from semdb.pictures.localization import draw_picture
+
+        return draw_picture(store(), shown, [thing.detection() for thing in objects], localization)
+
+    return Answer(
+        image=query.name,
+        verdict=localization.verdict,
+        map=localization.map_name,
+        world_from_camera=None if pose is None else frozen(pose),
+        covariance=None if localization.covariance is None else frozen(localization.covariance),
+        confidence=localization.confidence,
+        inliers=localization.inliers,
+        stage=localization.stage,
+        reason=localization.reason,
+        objects=objects,
+        candidates=localization.candidates,
+        ranked_share=localization.ranked_share,
+        keyframes_matched=localization.keyframes_matched,
+        refinements=localization.refinements,
+        timing_ms=localization.timing_ms,
+        draw=draw,
+    )
+
+
+def keyframe_of(head: KeyframeHead, content: KeyframeContent) -> Keyframe:
+    """The keyframe that reads from `content` what is large."""
+    return Keyframe(
+        id=head.id,
+        map=head.map,
+        recording=head.recording,
+        frame_index=head.frame_index,
+        timestamp_ns=head.timestamp_ns,
+        camera=head.camera,
+        world_from_camera=frozen(head.world_from_camera),
+        content=content,
+    )
+
+
+class StoredContent:
+    """Reads what keyframes hold from a store."""
+
+    def __init__(self, store: Callable[[], Store]) -> None:
+        self._store = store
+
+    def image(self, keyframe_id: int) -> ImageArray:
+        """RGB ``[H, W, 3]``. Raises NotFoundError, FrameError."""
+        from semdb.recordings.images import decode_color
+
+        return decode_color(self._store().load_image(keyframe_id).rgb, f"keyframe {keyframe_id}")
+
+    def depth(self, keyframe_id: int, camera: Camera) -> Float32Array | None:
+        """Metres ``[H, W]``, registered to the image of `camera`; None without. Raises NotFoundError, FrameError."""
+        from semdb.recordings.images import decode_depth
+        from semdb.recordings.registration import depth_size, register_depth
+
+        stored = self._store().load_image(keyframe_id)
+        if stored.depth is None or stored.depth_scale is None:
+            return None
+        size = depth_size(camera, stored.depth_registration)
+        depth = decode_depth(stored.depth, f"depth of keyframe {keyframe_id}", stored.depth_scale, size)
+        return register_depth(depth, stored.depth_registration, camera)
+
+    def objects(self, keyframe_id: int) -> tuple[SeenObject, ...]:
+        """What was seen, by ordinal. Raises NotFoundError, CodecError."""
+        store = self._store()
+        [stored] = store.load_keyframes([keyframe_id], descriptors=False)
+        return tuple(
+            SeenObject.of(
+                thing.category,
+                thing.score,
+                thing.box,
+                mask,
+                centroid=thing.geometry.centroid,
+                extent=thing.geometry.extent,
+                world_from_camera=stored.world_from_camera,
+                row_id=thing.id,
+            )
+            for thing, mask in zip(stored.objects, store.load_masks(keyframe_id), strict=True)
+        )
+
+    def keypoints(self, keyframe_id: int) -> Keypoints:
+        """Keypoints without descriptors. Raises NotFoundError, CodecError."""
+        [stored] = self._store().load_keyframes([keyframe_id], descriptors=False)
+        return stored.keypoints

@@ -1,0 +1,179 @@
+"""Images to poses."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, overload
+
+from semdb.api.answers import answer_of
+from semdb.api.base import Base
+from semdb.database.store import Store
+from semdb.door.values import Answer
+from semdb.errors import DatabaseError, FrameError, NotFoundError, UsageError
+
+if TYPE_CHECKING:  # the rooms behind are entered when something is asked of them: they take a second to import
+    from semdb.localization.open_maps import OpenMap
+    from semdb.localization.query_image import Depth, Image, LikeCamera, PathText
+    from semdb.recordings.arrays import CameraLike
+    from semdb.types import Localization
+
+
+class Localizing(Base):
+    """Says where images were taken."""
+
+    @overload
+    def localize(
+        self,
+        image: Image,
+        *,
+        map: str | None = None,
+        depth: Depth | None = None,
+        camera: CameraLike | None = None,
+        depth_scale: float | None = None,
+        like: PathText | None = None,
+        coarse: str = "index",
+        name: str | None = None,
+        log: bool = True,
+    ) -> Answer: ...
+
+    @overload
+    def localize(
+        self,
+        image: list[Any] | tuple[Any, ...],
+        *,
+        map: str | None = None,
+        depth: Sequence[Depth | None] | None = None,
+        camera: CameraLike | None = None,
+        depth_scale: float | None = None,
+        like: PathText | None = None,
+        coarse: str = "index",
+        name: Sequence[str] | None = None,
+        log: bool = True,
+    ) -> list[Answer]: ...
+
+    def localize(
+        self,
+        image: Image | list[Any] | tuple[Any, ...],
+        *,
+        map: str | None = None,
+        depth: Any = None,
+        camera: CameraLike | None = None,
+        depth_scale: float | None = None,
+        like: PathText | None = None,
+        coarse: str = "index",
+        name: Any = None,
+        log: bool = True,
+    ) -> Answer | list[Answer]:
+        """Where an image was taken; a list of images gives a list of answers.
+
+        An image is an RGB (not BGR) or grey array uint8 ``[H, W, 3]``, ``[H, W]``, the path of a file, the bytes of
+        one, or a `Frame`. `depth` is of its size and registered to it: an array in metres, or of integers with
+        `depth_scale` units per metre, a path, or bytes; of several images, one each. `camera` is ``(fx, fy, cx, cy[,
+        k1, k2, p1, p2[, k3]])`` in pixels, a `Camera` or a matrix ``[3, 3]``; `like` the name or folder of a recording
+        whose camera took the image; without both it is the one camera of the map's keyframes. `map` None asks every
+        map. `coarse` is ``index`` (from memory) or ``sql``; both answer alike. `name` is what an array is called in the
+        answer and in the log of queries, which `log` False leaves out.
+
+        An image that cannot be localized is an answer, ``failed``. Raises FrameError for an image, depth or camera that
+        cannot be used, NotFoundError for a map that is not there or empty, ProvenanceError for other models than the
+        map's, UsageError, ModelError, DatabaseError.
+        """
+        import numpy as np
+
+        many = isinstance(image, list | tuple) or (isinstance(image, np.ndarray) and image.ndim == 4)
+        images: list[Any] = list(image) if many else [image]  # type: ignore[arg-type]
+        depths, names = (depth, name) if many else ([depth], [name])
+        answers = self.localize_each(
+            images,
+            map=map,
+            depth=None if depths is None else list(depths),
+            camera=camera,
+            depth_scale=depth_scale,
+            like=like,
+            coarse=coarse,
+            names=None if names is None else list(names),
+            log=log,
+        )
+        return list(answers) if many else next(answers)
+
+    def localize_each(
+        self,
+        images: Sequence[Image],
+        *,
+        map: str | None = None,
+        depth: Sequence[Depth | None] | None = None,
+        camera: CameraLike | None = None,
+        depth_scale: float | None = None,
+        like: PathText | None = None,
+        coarse: str = "index",
+        names: Sequence[str | None] | None = None,
+        log: bool = True,
+        unreadable: Callable[[FrameError], None] | None = None,
+    ) -> Iterator[Answer]:
+        """As `localize`, the answers one by one as they are there.
+
+        An image that cannot be read is told to `unreadable`, where that is given, and the others go on.
+        """
+        from semdb.localization.open_maps import ask
+        from semdb.localization.query_image import QueryReader
+        from semdb.recordings.arrays import as_camera
+
+        if depth and len(depth) != len(images):
+            raise UsageError(f"{len(depth)} depth images for {len(images)} images: give --depth once per image")
+        if names is not None and len(names) != len(images):
+            raise UsageError(f"{len(names)} names for {len(images)} images: give one each")
+        store, open_maps = self._store(), self._here.maps()
+        maps = open_maps.asked(map, coarse)
+        reader = QueryReader(
+            camera=None if camera is None else as_camera(camera),
+            like=None if like is None else self._like(maps, str(like)),
+            known=lambda: open_maps.cameras(maps),
+            depth_scale=depth_scale,
+            on_disk=self._here.on_disk(),
+            say=self._say,
+        )
+        for number, image in enumerate(images):
+            started = time.perf_counter()
+            name = None if names is None else names[number]
+            try:
+                query = reader.read(image, depth[number] if depth else None, name, number if len(images) > 1 else None)
+            except FrameError as error:
+                if unreadable is None:
+                    raise
+                unreadable(error)
+                continue
+            decode_ms = (time.perf_counter() - started) * 1000
+            maps = open_maps.asked(map, coarse) if number else maps  # as they are now
+            found = ask(maps, query)
+            timing = {"decode": decode_ms, **found.description.timing_ms, **found.localization.timing_ms}
+            timing["total"] = (time.perf_counter() - started) * 1000
+            found = replace(found, localization=replace(found.localization, timing_ms=timing))
+            if log:
+                self._log(store, maps, query.name, found.localization)
+            yield answer_of(found, self._store)
+
+    def _like(self, maps: Sequence[OpenMap], name: str) -> LikeCamera:
+        """The camera of a recording that the database knows by name, or of one on disk."""
+        from semdb.localization.query_image import LikeCamera
+
+        store = self._store()
+        for entry in maps:
+            try:
+                camera, depth_scale = store.recording_camera(store.find_recording(entry.head.id, name))
+            except NotFoundError:
+                continue
+            return LikeCamera(camera, depth_scale, f"recording {name!r}")
+        if Path(name).exists():
+            return self._here.on_disk().camera_like(Path(name))
+        raise UsageError(f"--like {name}: neither a recording in the database nor a folder")
+
+    def _log(self, store: Store, maps: Sequence[OpenMap], image: str, localization: Localization) -> None:
+        """An answer is given also where it cannot be logged, as with an account that may only read."""
+        map_id = next(entry.head.id for entry in maps if entry.head.name == localization.map_name)
+        try:
+            store.log_query(map_id, image, localization)
+        except DatabaseError as error:
+            self._say(f"the answer for {image} is not in the log of queries: {error}")

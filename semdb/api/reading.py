@@ -1,0 +1,103 @@
+"""What is there: maps, recordings, keyframes, rows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from semdb.api.answers import StoredContent, keyframe_of
+from semdb.api.base import Base
+from semdb.database.records import FailedItem, MapInfo, RecordingStatus, Refinement
+from semdb.door.values import Keyframe, Rows
+from semdb.errors import NotFoundError, UsageError
+
+if TYPE_CHECKING:
+    from semdb.database.reporting import WorkerStatus
+    from semdb.types import ModelInfo
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """The recordings of a map, or of all, the keyframes of them that failed, and what `refine` has computed."""
+
+    url: str  # without its password
+    recordings: tuple[RecordingStatus, ...]
+    failed: tuple[FailedItem, ...]
+    refinements: tuple[Refinement, ...]
+
+
+class Reading(Base):
+    """Looks at what a database holds."""
+
+    def maps(self) -> list[MapInfo]:
+        """All maps with how many recordings and keyframes they have, by id."""
+        return self._store().maps()
+
+    def models(self, map: str) -> tuple[ModelInfo, ...]:
+        """The detector, encoder and features that describe a map; empty for an empty one. Raises NotFoundError."""
+        return self._store().map_models(self._store().find_map(map).id)
+
+    def recordings(self, map: str | None = None) -> list[RecordingStatus]:
+        """The recordings of a map, or of all, with what is planned and stored. Raises NotFoundError."""
+        return self._store().status(self._map_id(map))
+
+    def recording(self, name: str, map: str | None = None) -> RecordingStatus:
+        """The recording of that name. Raises NotFoundError, UsageError where several maps have one."""
+        everything = self.recordings(map)
+        found = [recording for recording in everything if recording.name == name]
+        if not found:
+            names = ", ".join(sorted({recording.name for recording in everything})) or "none"
+            raise NotFoundError(f"there is no recording {name!r} in {self.url}; recordings: {names}")
+        if len(found) > 1:
+            maps = ", ".join(recording.map for recording in found)
+            raise UsageError(f"the maps {maps} each have a recording {name!r}: say which with --map")
+        return found[0]
+
+    def keyframe(self, keyframe_id: int) -> Keyframe:
+        """The keyframe with that id. Raises NotFoundError."""
+        return keyframe_of(self._store().keyframe_heads_of([keyframe_id])[0], StoredContent(self._store))
+
+    def keyframes(
+        self, map: str, recording: str | None = None, *, after: int = 0, limit: int | None = None
+    ) -> list[Keyframe]:
+        """The keyframes of a map, or of a recording of it, by id; at most `limit` of those after the id `after`.
+
+        Raises NotFoundError.
+        """
+        store = self._store()
+        map_id = store.find_map(map).id
+        recording_id = None if recording is None else store.find_recording(map_id, recording)
+        heads = store.keyframe_heads(map_id, recording_id, after=after, limit=limit)
+        return [keyframe_of(head, StoredContent(self._store)) for head in heads]
+
+    def sql(self, statement: str) -> Rows:
+        """The rows of one read-only statement, fetched while they are iterated over.
+
+        On a server it runs as the account of ``SEMDB_READER_URL``. Raises UsageError for what is no query,
+        DatabaseError where the database refuses it or the time limit ``SEMDB_SQL_TIME_LIMIT_S`` is over, also while
+        rows are fetched.
+        """
+        from semdb.database.readonly import run_readonly
+
+        self._here.check_open()
+        return Rows(*run_readonly(self.settings, statement))
+
+    def status(self, map: str | None = None) -> Status:
+        """The recordings of a map, or of all, what failed of them, and what `refine` has computed."""
+        store = self._store()
+        recordings = store.status(self._map_id(map))
+        known = {recording.recording_id for recording in recordings}
+        failed = [item for item in store.failed_items() if item.recording_id in known]
+        return Status(store.url, tuple(recordings), tuple(failed), tuple(store.refinements()))
+
+    def workers(self) -> list[WorkerStatus]:
+        """Who works on keyframes now, by name."""
+        from semdb.database.reporting import workers
+
+        return workers(self._store().engine)
+
+    def unsent(self) -> int:
+        """How many planned keyframes wait for which no message to workers is known to be on its way."""
+        from semdb.database.items import unsent
+
+        return unsent(self._store().engine)

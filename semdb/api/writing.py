@@ -1,0 +1,177 @@
+"""Recordings to rows, and what is done to rows later."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING
+
+from semdb.api.reading import Reading
+from semdb.database.records import Deleted, RecordingStatus
+from semdb.errors import UsageError
+
+if TYPE_CHECKING:  # the rooms behind are entered when something is asked of them: they take a second to import
+    from semdb.door.protocol import Source
+    from semdb.ingestion.queue import Send
+    from semdb.ingestion.run import IngestOptions, IngestSummary, Progress
+    from semdb.localization.query_image import PathText
+    from semdb.recordings.arrays import CameraLike
+    from semdb.recordings.options import ReadOptions
+    from semdb.refinement.run import StepResult
+
+
+class Writing(Reading):
+    """Ingests, refines and deletes."""
+
+    def ingest(
+        self,
+        source: Source,
+        *,
+        map: str | None = None,
+        name: str | None = None,
+        keyframes: int | None = None,
+        stride: int | None = None,
+        camera: CameraLike | None = None,
+        reading: ReadOptions | None = None,
+        depth_scale: float | None = None,
+        progress: Progress | None = None,
+    ) -> list[IngestSummary]:
+        """Selects keyframes, describes and stores them; running it again adds nothing, cut off it goes on.
+
+        `source` is the folder or URL of a recording, or several, or an iterable of `Frame`, as of a live camera: these
+        go to a temporary folder as they come, are one recording, and need its `name`. `keyframes` takes that many,
+        those with the least common view, `stride` every stride-th frame, neither as many as it takes. `camera` and
+        `reading` say of folders what their files do not. `depth_scale` is units per metre of depth files, or of those
+        that are made of depth in memory (5000). `progress` is told what, done and total (0: not known). Makes a SQLite
+        file that is not there. Returns one summary per recording.
+
+        Raises RecordingError for what cannot be used at all, UsageError where models or plan contradict what is stored,
+        ModelError, DatabaseError.
+        """
+        from semdb.api.sources import ingest_options, open_source
+        from semdb.ingestion.run import ingest_opened
+
+        options = ingest_options(map, name, keyframes, stride, camera, reading, depth_scale)
+        with open_source(source, self.settings, options, progress, self._check_ingest) as recordings:
+            store = self._store(create=True)
+            with self._here.describers() as describers:
+                return ingest_opened(
+                    recordings,
+                    store,
+                    self.settings,
+                    options,
+                    describers=describers,
+                    progress=progress,
+                    say=self._say,
+                )
+
+    def queue(
+        self,
+        paths: Sequence[PathText],
+        send: Send,
+        *,
+        map: str | None = None,
+        name: str | None = None,
+        keyframes: int | None = None,
+        stride: int | None = None,
+        camera: CameraLike | None = None,
+        reading: ReadOptions | None = None,
+        progress: Progress | None = None,
+    ) -> list[IngestSummary]:
+        """Plans recordings and sends their keyframes to workers by `send` (`semdb.workers.send_items`)."""
+        from semdb.api.sources import ingest_options
+        from semdb.ingestion.queue import queue_recordings
+
+        options = ingest_options(map, name, keyframes, stride, camera, reading)
+        return queue_recordings(
+            [str(path) for path in paths],
+            self.settings,
+            options,
+            send,
+            store=self._store(create=True),
+            progress=progress,
+            say=self._say,
+        )
+
+    def resume(self, send: Send) -> int:
+        """Sends all that is planned and not done to the workers again. Returns how many keyframes."""
+        from semdb.ingestion.queue import sweep
+
+        return sweep(self._store(), send, all_pending=True)
+
+    def retry(self, map: str | None = None) -> list[tuple[RecordingStatus, int]]:
+        """Puts keyframes that failed back into the plan. Returns how many of each recording of a map, or of all."""
+        from semdb.database.requeue import requeue_failed
+
+        store = self._store()
+        return [
+            (recording, requeue_failed(store.engine, recording.recording_id))
+            for recording in store.status(self._map_id(map))
+        ]
+
+    def refine(
+        self,
+        map: str | None = None,
+        *,
+        steps: Sequence[str] = (),
+        force: bool = False,
+        progress: Progress | None = None,
+    ) -> list[StepResult]:
+        """Computes what needs more than one keyframe, where it is out of date, of a map or of all that hold keyframes.
+
+        Raises UsageError for a step that is none, NotFoundError, DatabaseError.
+        """
+        from semdb.refinement.run import refine_map, steps_of
+
+        steps_of(steps)
+        store = self._store()
+        infos = [store.find_map(map)] if map is not None else [info for info in store.maps() if info.keyframes]
+        results: list[StepResult] = []
+        for info in infos:
+            results += refine_map(store, info, kinds=steps, force=force, progress=progress)
+        return results
+
+    def delete(
+        self,
+        *,
+        map: str | None = None,
+        recording: str | None = None,
+        keyframes: Iterable[int] | None = None,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> Deleted:
+        """Deletes a map, a recording (of `map`, where several have one of that name) or single keyframes for good.
+
+        Raises NotFoundError before anything is deleted, UsageError.
+        """
+        store = self._store()
+        if keyframes is not None:
+            if map is not None or recording is not None:
+                raise UsageError("delete either keyframes or a recording or a map")
+            wanted = sorted({int(key) for key in keyframes})
+            store.keyframe_heads_of(wanted)  # says which one does not exist
+            return Deleted(0, store.delete_keyframes(wanted, progress))
+        if recording is not None:
+            return store.delete_recording(self.recording(recording, map).recording_id, progress)
+        if map is not None:
+            return store.delete_map(store.find_map(map).id, progress)
+        raise UsageError("say what to delete: map=, recording= or keyframes=")
+
+    def init(self) -> tuple[str | None, str]:
+        """Creates or upgrades the schema. Returns its revision before (None: there was none) and now."""
+        from semdb.database import schema
+        from semdb.database.engine import make_engine
+
+        engine = make_engine(self.settings.database_url)
+        try:
+            before = schema.current_revision(engine)
+            schema.upgrade(engine)
+        finally:
+            engine.dispose()
+        return before, schema.HEAD
+
+    def _check_ingest(self, options: IngestOptions, has_masks: bool) -> None:
+        """Loads the networks: one that is missing should not be noticed after an hour of frames."""
+        from semdb.ingestion.run import describers_for
+
+        store = self._store(create=True)
+        with self._here.describers() as describers:
+            describers_for(options.map_name or options.name or "", has_masks, store, self.settings, describers)

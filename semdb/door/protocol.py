@@ -1,0 +1,109 @@
+"""What a program can ask, wherever the database is: on this machine (`semdb.open`), or behind a service."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any, Protocol, Self, TypeAlias, overload
+
+if TYPE_CHECKING:
+    from semdb.database.records import Deleted, MapInfo, RecordingStatus
+    from semdb.door.values import Answer, Keyframe, Rows
+    from semdb.ingestion.run import IngestSummary
+    from semdb.localization.query_image import Depth, Image, PathText
+    from semdb.recordings.arrays import CameraLike
+    from semdb.recordings.base import Recording
+    from semdb.recordings.options import ReadOptions
+    from semdb.refinement.run import StepResult
+    from semdb.types import Frame, ModelInfo
+
+    Source: TypeAlias = PathText | Sequence[PathText] | Recording | Iterable[Frame]
+
+
+class SemanticDatabase(Protocol):
+    """Maps, recordings and keyframes, and images to poses in them; see `semdb.api.Database` for what each takes.
+
+    Every method raises a child of `SemdbError` that says what to do. Close it, or use it in a ``with``.
+    """
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def close(self) -> None: ...
+
+    @property
+    def url(self) -> str: ...
+
+    def maps(self) -> list[MapInfo]: ...
+
+    def models(self, map: str) -> tuple[ModelInfo, ...]: ...
+
+    def recordings(self, map: str | None = None) -> list[RecordingStatus]: ...
+
+    def recording(self, name: str, map: str | None = None) -> RecordingStatus: ...
+
+    def keyframe(self, keyframe_id: int) -> Keyframe: ...
+
+    def keyframes(
+        self, map: str, recording: str | None = None, *, after: int = 0, limit: int | None = None
+    ) -> list[Keyframe]: ...
+
+    def sql(self, statement: str) -> Rows: ...
+
+    @overload
+    def localize(
+        self,
+        image: Image,
+        *,
+        map: str | None = None,
+        depth: Depth | None = None,
+        camera: CameraLike | None = None,
+        depth_scale: float | None = None,
+        like: PathText | None = None,
+        name: str | None = None,
+    ) -> Answer: ...
+
+    @overload
+    def localize(
+        self,
+        image: list[Any] | tuple[Any, ...],
+        *,
+        map: str | None = None,
+        depth: Sequence[Depth | None] | None = None,
+        camera: CameraLike | None = None,
+        depth_scale: float | None = None,
+        like: PathText | None = None,
+        name: Sequence[str] | None = None,
+    ) -> list[Answer]: ...
+
+    def ingest(
+        self,
+        source: Source,
+        *,
+        map: str | None = None,
+        name: str | None = None,
+        keyframes: int | None = None,
+        stride: int | None = None,
+        camera: CameraLike | None = None,
+        reading: ReadOptions | None = None,
+        depth_scale: float | None = None,
+        progress: Callable[[str, int, int], None] | None = None,
+    ) -> list[IngestSummary]: ...
+
+    def refine(
+        self,
+        map: str | None = None,
+        *,
+        steps: Sequence[str] = (),
+        force: bool = False,
+        progress: Callable[[str, int, int], None] | None = None,
+    ) -> list[StepResult]: ...
+
+    def delete(
+        self,
+        *,
+        map: str | None = None,
+        recording: str | None = None,
+        keyframes: Iterable[int] | None = None,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> Deleted: ...
