@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from semdb.cli.options import JsonFlag, Overrides, settings_options
+from semdb.rights import folder_problem
 
 if TYPE_CHECKING:
     from semdb.settings import Settings
@@ -162,7 +163,12 @@ def folders(settings: Settings) -> Iterator[Check]:
         if folder is None:
             continue
         nearest = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
-        if os.access(nearest, os.W_OK) and nearest.is_dir():
+        problem = folder_problem(nearest) if nearest == folder else None
+        if problem is not None:
+            yield Check(
+                "problem", what, f"{problem}: what it keeps is not used; chmod go-w, or set it to a folder of your own"
+            )
+        elif os.access(nearest, os.W_OK) and nearest.is_dir():
             yield Check("ok", what, str(folder) + ("" if nearest == folder else " (made when needed)"))
         else:
             yield Check(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import re
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,7 +12,7 @@ import typer
 
 from semdb.cli.options import JsonFlag, Overrides, settings_options
 from semdb.cli.output import print_json, print_lines, print_table
-from semdb.errors import UsageError
+from semdb.errors import ModelError, UsageError
 
 if TYPE_CHECKING:
     from semdb.cli.progress import Progress
@@ -76,6 +78,10 @@ def list_models(overrides: Overrides, json: JsonFlag = False) -> None:
 @command.command("pull")
 def pull_models(
     names: Annotated[list[str], typer.Argument(metavar="NAME...", help="Published models by name, or all.")],
+    sha256: Annotated[
+        str | None,
+        typer.Option("--sha256", metavar="HEX", help="Hash that the file must have, where its publisher gives none."),
+    ] = None,
 ) -> None:
     """Download the weights of published models into the models folder.
 
@@ -84,21 +90,39 @@ def pull_models(
     """
     from semdb.cli.options import load_settings
     from semdb.cli.progress import Progress as Bar
+    from semdb.cli.progress import say
     from semdb.perception.catalogue import BY_NAME, PUBLISHED
     from semdb.perception.pull import pull
 
     unknown = [name for name in names if name != "all" and name not in BY_NAME]
     if unknown:
         raise UsageError(f"no published model {', '.join(unknown)}: known are {', '.join(BY_NAME)}, and all")
+    wanted = list(PUBLISHED) if "all" in names else [BY_NAME[name] for name in dict.fromkeys(names)]
+    if sha256 is not None:
+        if not re.fullmatch(r"[0-9a-fA-F]{64}", sha256) or len(wanted) != 1:
+            raise UsageError("--sha256 takes the 64 hexadecimal digits of the file of one model")
+        if not sha256.lower().startswith(wanted[0].sha256):
+            raise UsageError(f"--sha256: the publisher of {wanted[0].name} gives another hash, {wanted[0].sha256}...")
+        wanted = [replace(wanted[0], sha256=sha256.lower())]
     folder = files_folder(load_settings())
-    for model in PUBLISHED if "all" in names else [BY_NAME[name] for name in dict.fromkeys(names)]:
-        with Bar(f"pulling {model.name}", unit="MB") as progress:
-            done = pull(model, folder, functools.partial(_show_megabytes, progress))
+    failed: list[ModelError] = []
+    for model in wanted:
+        try:
+            with Bar(f"pulling {model.name}", unit="MB") as progress:
+                done = pull(model, folder, functools.partial(_show_megabytes, progress))
+        except ModelError as error:
+            if len(wanted) == 1:
+                raise
+            failed.append(error)  # the others go on
+            say(str(error))
+            continue
         print_lines(
             f"{model.name}: {'pulled' if done.fetched else 'there already'}, {done.path}, sha256 {done.sha256[:16]}…"
             + (" (recorded: its publisher gives none)" if done.recorded else ", as it should be")
             + f"; licence {model.licence}; use it as {model.spec}"
         )
+    if failed:
+        raise typer.Exit(1)
 
 
 @command.command("export")
@@ -164,7 +188,7 @@ def model_files(settings: Settings, used: list[dict[str, Any]]) -> list[dict[str
     ``sha256`` is empty for what is not at hand.
     """
     from semdb.perception.catalogue import PUBLISHED
-    from semdb.perception.model_files import file_sha256
+    from semdb.perception.model_files import file_sha256, onnx_sha256
 
     folder = files_folder(settings)
     rows = [
@@ -187,7 +211,8 @@ def model_files(settings: Settings, used: list[dict[str, Any]]) -> list[dict[str
                 rows.append({**row, "licence": _licence_in(path)})
     for row in rows:
         path = folder / row["file"]
-        row["sha256"] = file_sha256(path) if path.is_file() else ""
+        hash_of = onnx_sha256 if path.suffix == ".onnx" else file_sha256
+        row["sha256"] = hash_of(path) if path.is_file() else ""
     return [
         {**row, "maps": sorted({u["map"] for u in used if row["sha256"] and u["sha256"] == row["sha256"]})}
         for row in rows

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from semdb.errors import ModelError, UsageError
+from semdb.perception.onnx_external import external_files
 from semdb.settings import Settings
 
 GPU_BATCH = 8  # images at once that keep a GPU busy
@@ -29,6 +30,23 @@ def file_sha256(path: Path) -> str:
     except OSError as error:
         raise ModelError(f"{path}: cannot read the model file ({error.strerror}); check its permissions") from error
     return _HASHES[key]
+
+
+def onnx_sha256(path: Path) -> str:
+    """Hex SHA-256 of an ONNX model: of the file, or, where it takes weights from others, of all their hashes together.
+
+    Raises ModelError.
+    """
+    others = external_files(path)
+    if not others:
+        return file_sha256(path)
+    missing = [str(other) for other in others if not other.is_file()]
+    if missing:
+        raise ModelError(f"{path} takes weights from {', '.join(missing)}, which is not there: keep both in one folder")
+    digest = hashlib.sha256(file_sha256(path).encode())
+    for other in others:
+        digest.update(f"|{other.relative_to(path.parent)}|{file_sha256(other)}".encode())
+    return digest.hexdigest()
 
 
 def models_dir(settings: Settings) -> Path:
@@ -70,7 +88,8 @@ def canonical_json(config: dict[str, Any]) -> str:
 class OnnxModel:
     """An ONNX network with one image input ``[B, 3, H, W]``.
 
-    `path` is the file, `outputs` the names of all its outputs, `metadata` its ``metadata_props``.
+    `path` is the file, `outputs` the names of all its outputs, `metadata` its ``metadata_props``, `sha256` the hash of
+    all its weights, those in other files too.
     """
 
     def __init__(self, path: Path, threads: int, required_outputs: tuple[str, ...], device: str = "cpu") -> None:
@@ -81,6 +100,7 @@ class OnnxModel:
         """
         import onnxruntime as ort
 
+        self.sha256 = onnx_sha256(path)  # before it is opened: no file out of its folder is
         options = ort.SessionOptions()
         options.intra_op_num_threads = threads
         options.inter_op_num_threads = 1

@@ -17,7 +17,7 @@ from semdb.perception.catalogue import BY_NAME
 from semdb.perception.detectors.torchvision import known_architecture, load_detector_checkpoint
 from semdb.perception.encoders.onnx import CROP
 from semdb.perception.encoders.torchvision import expected_outputs, load_encoder_checkpoint
-from semdb.perception.model_files import file_sha256, first_line
+from semdb.perception.model_files import file_sha256, first_line, onnx_sha256
 from semdb.perception.torch_models import import_torch, resolve_checkpoint
 from semdb.settings import Settings
 
@@ -63,7 +63,7 @@ def export(spec: str, target: Path, settings: Settings) -> Exported:
         new.replace(target)
     finally:
         new.unlink(missing_ok=True)
-    return Exported(target, role, file_sha256(target))
+    return Exported(target, role, onnx_sha256(target))
 
 
 def _role_of(path: Path) -> str:

@@ -25,6 +25,13 @@ from semdb.types import Camera
 _ADDRESS = re.compile(r"[a-z][a-z0-9+.-]*://")
 _SAID = re.compile(rf"\?(?:camera|{'|'.join(field.name for field in fields(ReadOptions))})=")  # in a source
 FETCHERS = 8  # files that are fetched at a time
+BLOCK = 1 << 22  # bytes of a file that are in memory at a time
+_PROTOCOLS = """
+abfs abfss az file ftp gcs git github gist gs hdfs hf http https local memory oci oss s3 s3a sftp smb ssh tar webdav
+webhdfs zip
+"""
+PROTOCOLS = frozenset(_PROTOCOLS.split())
+_BARE_PROTOCOL = re.compile(r"[a-z]+")  # as fsspec reads it
 
 
 def is_address(path: str) -> bool:
@@ -94,7 +101,7 @@ def fetch(address: str, cache: Path) -> Path:
     if not listing:
         raise RecordingError(f"{address}: there is nothing there")
     name = address.rstrip("/").rsplit("/", 1)[-1] or "recording"
-    folder = cache / hashlib.sha256(address.rstrip("/").encode()).hexdigest()[:16] / name
+    folder = cache / hashlib.sha256(address.rstrip("/").encode(errors="surrogateescape")).hexdigest()[:16] / name
     prefix = str(root).rstrip("/") + "/"
     wanted = []
     for remote, info in listing.items():
@@ -103,11 +110,11 @@ def fetch(address: str, cache: Path) -> Path:
         target = folder / relative
         if not target.resolve().is_relative_to(folder.resolve()):
             raise RecordingError(f"{address}: has a file of the impossible name {relative!r}")
-        if not _is_there(target, info):
-            wanted.append((str(remote), target))
+        if _is_file(str(remote), info) and not _is_there(target, info):
+            wanted.append((str(remote), target, info.get("size")))
     try:
         with ThreadPoolExecutor(FETCHERS) as pool:
-            for done in [pool.submit(_fetch_file, system, remote, target) for remote, target in wanted]:
+            for done in [pool.submit(_fetch_file, system, *one) for one in wanted]:
                 done.result()
     except Exception as error:
         raise _unavailable(address, error) from error
@@ -115,6 +122,7 @@ def fetch(address: str, cache: Path) -> Path:
 
 
 def _file_system(address: str) -> tuple[Any, str]:
+    check_protocols(address)
     try:
         import fsspec
     except ImportError as error:
@@ -123,7 +131,31 @@ def _file_system(address: str) -> tuple[Any, str]:
         system, root = fsspec.core.url_to_fs(address)
     except (ImportError, ValueError) as error:
         raise UsageError(f"{address}: {error}") from error
+    except Exception as error:
+        raise _unavailable(address, error) from error
     return system, str(root)
+
+
+def check_protocols(address: str) -> None:
+    """Raises UsageError for a URL, or one in a chain (``zip://room::s3://bucket/a.zip``), that is not of `PROTOCOLS`.
+
+    fsspec has file systems that are programs in disguise: their files are templates, pickles or addresses of others.
+    """
+    for part in address.split("::"):
+        protocol, found, _ = part.partition("://")
+        if not found and not _BARE_PROTOCOL.fullmatch(part):
+            continue  # a path of this machine
+        if protocol not in PROTOCOLS:
+            raise UsageError(
+                f"{address}: recordings are not fetched by {protocol}://; by {', '.join(sorted(PROTOCOLS))} they are"
+            )
+
+
+def _is_file(remote: str, info: dict[str, Any]) -> bool:
+    """Whether it is a regular file, or a link of this machine to one."""
+    if info.get("islink"):
+        return Path(remote).is_file()
+    return info.get("type", "file") == "file"
 
 
 def _is_there(target: Path, info: dict[str, Any]) -> bool:
@@ -133,11 +165,16 @@ def _is_there(target: Path, info: dict[str, Any]) -> bool:
     return target.stat().st_size == info.get("size")
 
 
-def _fetch_file(system: Any, remote: str, target: Path) -> None:
+def _fetch_file(system: Any, remote: str, target: Path, size: int | None) -> None:
+    """Copies a file block by block. Raises OSError for one that has more than the `size` that was listed."""
     target.parent.mkdir(parents=True, exist_ok=True)
     part = target.with_name(f".{target.name}.{os.getpid()}.{secrets.token_hex(4)}")
     try:
-        part.write_bytes(system.cat_file(remote))
+        with system.open(remote, "rb") as source, part.open("wb") as copy:
+            while block := source.read(BLOCK):
+                copy.write(block)
+                if size is not None and copy.tell() > size:
+                    raise OSError(f"{remote} has more than the {size} bytes that are listed")
         part.replace(target)  # whole, or not at all: several workers may fetch it
     finally:
         part.unlink(missing_ok=True)

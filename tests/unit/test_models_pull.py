@@ -22,7 +22,7 @@ from semdb.cli.models import model_files
 from semdb.errors import ModelError
 from semdb.perception import catalogue
 from semdb.perception.catalogue import Published
-from semdb.perception.pull import RECORD, pull, recorded_hashes
+from semdb.perception.pull import RECORD, most_bytes, pull, recorded_hashes
 from semdb.settings import Settings
 from tests.unit.onnx_files import write_constant_model
 
@@ -36,6 +36,7 @@ class Server(ThreadingHTTPServer):
     def __init__(self) -> None:
         super().__init__(("127.0.0.1", 0), _Handler)
         self.content, self.break_after, self.ranges = CONTENT, 0, True
+        self.redirect, self.says_length = "", True
         self.asked: list[str] = []
 
     @property
@@ -53,6 +54,11 @@ class _Handler(BaseHTTPRequestHandler):
         if not self.path.endswith("weights.pth"):
             self.send_error(404)
             return
+        if server.redirect:
+            self.send_response(302)
+            self.send_header("Location", server.redirect)
+            self.end_headers()
+            return
         start = int(re.sub(r"\D", "", wanted)) if wanted and server.ranges else 0
         if start >= len(server.content):
             self.send_response(416)
@@ -62,7 +68,8 @@ class _Handler(BaseHTTPRequestHandler):
             return
         body = server.content[start:]
         self.send_response(206 if start else 200)
-        self.send_header("Content-Length", str(len(body)))
+        if server.says_length:
+            self.send_header("Content-Length", str(len(body)))
         self.end_headers()
         if server.break_after:
             self.wfile.write(body[: server.break_after])
@@ -209,3 +216,64 @@ def test_published_models_are_complete() -> None:
     for model in catalogue.PUBLISHED:
         assert all(getattr(model, field.name) for field in dataclasses.fields(model) if field.name != "sha256")
     assert [model.name for model in catalogue.PUBLISHED if not model.sha256] == ["resnet50-places365"]
+
+
+def test_plain_http_is_refused_without_a_hash(tmp_path: Path) -> None:
+    model = published("http://models.example.org/weights.pth", "")
+    with pytest.raises(ModelError, match=r"is not encrypted, and no hash of weights\.pth is published.*--sha256 HEX"):
+        pull(model, tmp_path / "models")
+    assert not (tmp_path / "models").exists()
+    with pytest.raises(ModelError, match="which is not fetched: only https and http are"):
+        pull(published("file:///etc/passwd", ""), tmp_path / "models")
+
+
+@pytest.mark.parametrize("target", ["http://models.example.org/weights.pth", "ftp://models.example.org/weights.pth"])
+def test_a_redirection_to_plain_http_is_refused_without_a_hash(server: Server, tmp_path: Path, target: str) -> None:
+    server.redirect = target
+    with pytest.raises(ModelError, match=r"is not encrypted|is not fetched"):
+        pull(published(server.url, ""), tmp_path)
+    assert not (tmp_path / "weights.pth").exists()
+
+
+def test_a_page_is_no_file_of_weights(server: Server, tmp_path: Path) -> None:
+    server.content = b"\n<!DOCTYPE html><title>Log in</title>"
+    with pytest.raises(ModelError, match="sent a page, not a file of weights; nothing was kept"):
+        pull(published(server.url, ""), tmp_path)
+    assert list(tmp_path.iterdir()) == []
+    assert recorded_hashes(tmp_path) == {}
+
+
+@pytest.mark.parametrize("says", [True, False])
+def test_a_file_that_is_much_too_large_is_left(server: Server, tmp_path: Path, says: bool) -> None:
+    model = published(server.url)
+    server.content, server.says_length = bytes(most_bytes(model) + 1), says
+    with pytest.raises(ModelError, match=r"sends 23 MB or more, but weights\.pth has 3 MB: that is another file"):
+        pull(model, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_part_that_is_larger_than_the_file_can_be_is_thrown_away(server: Server, tmp_path: Path) -> None:
+    with (tmp_path / "weights.pth.part").open("wb") as file:
+        file.truncate(60 << 30)
+    assert pull(published(server.url), tmp_path).path.read_bytes() == CONTENT
+    assert server.asked == [""]
+
+
+def test_command_takes_a_hash_and_goes_on_after_a_failure(
+    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tiny = published(server.url, "")
+    bad = dataclasses.replace(tiny, name="bad", file="bad.pth", url="http://models.example.org/bad.pth")
+    monkeypatch.setattr(catalogue, "PUBLISHED", (bad, tiny))
+    monkeypatch.setattr(catalogue, "BY_NAME", {"tiny": tiny, "bad": bad})
+    monkeypatch.setenv("SEMDB_CACHE_DIR", str(tmp_path))
+    run = CliRunner().invoke
+    assert run(app, ["models", "pull", "tiny", "--sha256", "12"]).exit_code == 2
+    wrong = run(app, ["models", "pull", "tiny", "--sha256", "0" * 64])
+    assert (wrong.exit_code, "not kept" in wrong.stderr) == (1, True)
+    done = run(app, ["models", "pull", "all"])
+    assert done.exit_code == 1
+    assert "bad.pth is not encrypted" in done.stderr
+    assert "tiny: pulled" in done.stdout
+    right = run(app, ["models", "pull", "tiny", "--sha256", SHA256.upper()])
+    assert "as it should be" in right.stdout

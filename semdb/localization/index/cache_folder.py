@@ -29,6 +29,7 @@ from semdb.localization.index.cache_files import (
 from semdb.localization.index.mirror import IndexOptions, Mirror
 from semdb.localization.index.reduction import Reduction
 from semdb.localization.index.vectors import Part
+from semdb.rights import folder_problem
 from semdb.types import Float32Array
 
 FORMAT = 1
@@ -61,13 +62,18 @@ class CacheFolder:
     def of(
         cls, cache_dir: Path, store: Store, map_id: int, say: Callable[[str], None] | None = None
     ) -> CacheFolder | None:
-        """The folder of a map below the cache folder, made if need be; None where it cannot be made."""
+        """The folder of a map below the cache folder, made if need be; None where it cannot be made or trusted."""
         path = cache_dir.expanduser() / "index" / database_key(store) / f"map-{map_id}"
         try:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             if say is not None:
                 say(f"the index is kept in memory alone: {path} cannot be made ({error.strerror})")
+            return None
+        problem = folder_problem(path)
+        if problem is not None:
+            if say is not None:
+                say(f"the index is kept in memory alone, because others could write its files: {problem}")
             return None
         return cls(path, store, map_id, say)
 

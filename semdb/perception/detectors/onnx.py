@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from semdb.errors import ModelError
 from semdb.perception.detectors.coco import COCO_91, NO_OBJECT
-from semdb.perception.model_files import OnnxModel, canonical_json, file_sha256, resolve_onnx
+from semdb.perception.model_files import OnnxModel, canonical_json, resolve_onnx
 from semdb.settings import Settings
 from semdb.types import BoolArray, Detection, Float32Array, ImageArray, InstanceMasks, ModelInfo
 
@@ -38,7 +38,7 @@ class OnnxDetector:
             "score_threshold": settings.score_threshold,
             "weak_threshold": WEAK_THRESHOLD,
         }
-        self.info = ModelInfo("detector", f"onnx:{path.name}", file_sha256(path), canonical_json(config))
+        self.info = ModelInfo("detector", f"onnx:{path.name}", self._model.sha256, canonical_json(config))
 
     def detect(self, image: ImageArray, instances: InstanceMasks | None = None) -> tuple[Detection, ...]:
         """Objects of an RGB `image` ``[H, W, 3]`` by descending score; `instances` are not used.

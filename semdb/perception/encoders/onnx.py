@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semdb.errors import ModelError
-from semdb.perception.model_files import GPU_BATCH, OnnxModel, canonical_json, file_sha256, resolve_onnx
+from semdb.perception.model_files import GPU_BATCH, OnnxModel, canonical_json, resolve_onnx
 from semdb.settings import Settings
 from semdb.types import Float32Array, ImageArray, ModelInfo
 
@@ -27,7 +27,7 @@ class OnnxEncoder:
         self._model = OnnxModel(path, settings.threads, ("embedding",), settings.device)
         config = canonical_json({"crop": CROP, "short_side": SHORT_SIDE})
         self.best_batch = GPU_BATCH if self._model.on_gpu and self._model.takes_batches else 1
-        self.info = ModelInfo("encoder", f"onnx:{path.name}", file_sha256(path), config)
+        self.info = ModelInfo("encoder", f"onnx:{path.name}", self._model.sha256, config)
 
     def encode(self, image: ImageArray) -> Float32Array:
         """The L2-normalised embedding float32 ``[d]`` of an RGB `image` ``[H, W, 3]``.
