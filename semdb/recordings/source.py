@@ -155,7 +155,7 @@ def _is_file(remote: str, info: dict[str, Any]) -> bool:
     """Whether it is a regular file, or a link of this machine to one."""
     if info.get("islink"):
         return Path(remote).is_file()
-    return info.get("type", "file") == "file"
+    return bool(info.get("type", "file") == "file")
 
 
 def _is_there(target: Path, info: dict[str, Any]) -> bool:
