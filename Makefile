@@ -1,5 +1,6 @@
 # make demo   install the base into .venv and run the demonstration (no setting, no model file needed)
 # make test   install everything, MySQL and MariaDB included, then lint, types and all tests
+# make test-long   as make test, for the tests that it leaves out: they take minutes each
 # make test-train   train a small detector on rendered rooms from random weights; 8 minutes on 2 cores
 # make lint   ruff and mypy            make lock    write requirements/constraints.txt anew
 # make bench  all benchmarks, on RECORDINGS="..." or a rendered room
@@ -16,7 +17,7 @@ LOCK := requirements/constraints.txt
 # two processes: each starts servers of its own
 PYTEST_ARGS ?= --numprocesses 2
 
-.PHONY: help demo test test-train unit lint services lock bench wheel clean
+.PHONY: help demo test test-long test-train unit lint services lock bench wheel clean
 
 help:
 	@sed -n 's/^# \(make \)/\1/p' Makefile
@@ -43,6 +44,9 @@ services:
 
 test: $(VENV)/.stamp-dev services lint
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+test-long: $(VENV)/.stamp-dev services
+	$(BIN)/python -m pytest -m long --timeout 3600 $(PYTEST_ARGS)
 
 test-train: $(VENV)/.stamp-dev
 	$(BIN)/python -m pytest tests/acceptance/train_detector.py --timeout 3600 -s

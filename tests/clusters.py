@@ -1,39 +1,65 @@
-"""Three nodes on loopback that hold the same: a Galera cluster of MariaDB."""
+"""Three nodes on loopback that hold the same: a Galera cluster of MariaDB, group replication of MySQL."""
 
 from __future__ import annotations
 
 import contextlib
 import secrets
 import time
-from collections.abc import Iterator, Sequence
+import uuid
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TypeVar
 
 import pytest
 
 from tests.mariadb import MARIADB
+from tests.mysql import MYSQL
 from tests.servers import Server, ServerError, server_folder
 from tests.services import free_port
 
 PROVIDER = Path("/usr/lib/galera/libgalera_smm.so")
 
 
-def url_of(nodes: Sequence[Server]) -> str:
-    """The URL of several servers, which have the same account."""
-    hosts = ",".join(f"127.0.0.1:{node.port}" for node in nodes)
-    return nodes[0].url().replace(f"127.0.0.1:{nodes[0].port}", hosts)
+AnyCluster = TypeVar("AnyCluster", bound="Cluster")
 
 
 class Cluster:
-    """Three Galera nodes on loopback."""
+    """Three nodes, the first of which takes writes."""
+
+    sync: str  # what a session says to see all that the cluster has committed
+
+    def __init__(self) -> None:
+        self.nodes: list[Server] = []
+        self.password = secrets.token_hex(12)
+
+    def start(self) -> None:
+        raise NotImplementedError
+
+    def rejoin(self, node: Server) -> None:
+        """Starts a node, which takes the state of the others; returns when it is one of them."""
+        raise NotImplementedError
+
+    def url(self, first: int = 0) -> str:
+        """The URL with all nodes, beginning with one."""
+        order = [*self.nodes[first:], *self.nodes[:first]]
+        return order[0].url().replace(f":{order[0].port}/", ":" + ",127.0.0.1:".join(str(n.port) for n in order) + "/")
+
+    def kill(self) -> None:
+        for node in self.nodes:
+            node.kill()
+
+
+class Galera(Cluster):
+    """Of MariaDB: each node takes writes."""
+
+    sync = "SET SESSION wsrep_sync_wait = 1"
 
     def __init__(self, folder: Path) -> None:
+        super().__init__()
         if not PROVIDER.exists():
             pytest.skip("no Galera here (galera-4): scripts/install-services.sh installs it")
-        self.nodes: list[Server] = []
-        password = secrets.token_hex(12)
         group = [free_port() for _ in range(3)]
         self.address = "gcomm://" + ",".join(f"127.0.0.1:{port}" for port in group)
-        folder.chmod(0o755)
         for number, port in enumerate(group):
             name = f"node{number}"
             transfer = free_port()
@@ -54,7 +80,7 @@ class Cluster:
                 "--wsrep-sst-method=rsync",
                 f"--wsrep-sst-receive-address=127.0.0.1:{transfer}",
             ]
-            self.nodes.append(Server(MARIADB, folder / name, options, password=password))
+            self.nodes.append(Server(MARIADB, folder / name, options, password=self.password))
 
     def start(self) -> None:
         first, *others = self.nodes
@@ -64,31 +90,115 @@ class Cluster:
             self.rejoin(node)
 
     def rejoin(self, node: Server) -> None:
-        """Starts a node, which takes the state of the others; returns when it is one of them."""
         node.start(f"--wsrep-cluster-address={self.address}")
-        deadline = time.monotonic() + 60
-        while node.execute("SHOW STATUS LIKE 'wsrep_local_state_comment'")[0][1] != "Synced":
-            if time.monotonic() > deadline:
-                raise ServerError("the node did not become one of the cluster")
-            time.sleep(0.1)
+        _wait(node, "SHOW STATUS LIKE 'wsrep_local_state_comment'", ("wsrep_local_state_comment", "Synced"))
 
-    def url(self, first: int = 0) -> str:
-        """The URL with all nodes, beginning with one."""
-        return url_of([*self.nodes[first:], *self.nodes[:first]])
 
-    def kill(self) -> None:
+class Group(Cluster):
+    """Of MySQL, with group replication: one node takes writes, the others copy them and elect another."""
+
+    sync = "SET SESSION group_replication_consistency = 'BEFORE'"
+
+    def __init__(self, folder: Path, *options: str) -> None:
+        """Raises ServerError where there is no MySQL."""
+        super().__init__()
+        ports = [free_port() for _ in range(3)]
+        seeds = ",".join(f"127.0.0.1:{port}" for port in ports)
+        name = str(uuid.uuid4())
+        for number, port in enumerate(ports):
+            node = Server(MYSQL, folder / f"node{number}", password=self.password)
+            node.options = [
+                *MYSQL.with_tls,  # nodes do not start without it, though they do not use it among them
+                "--performance-schema=ON",  # it has the list of members
+                "--performance-schema-instrument=%=OFF",
+                # With less a node that is killed has in its binary log what it has lost, and never gets it again.
+                "--innodb-flush-log-at-trx-commit=1",
+                f"--server-id={number + 1}",
+                "--log-bin=changes",
+                "--gtid-mode=ON",
+                "--enforce-gtid-consistency=ON",
+                "--plugin-load-add=group_replication.so",
+                f"--loose-group-replication-group-name={name}",
+                f"--loose-group-replication-local-address=127.0.0.1:{port}",
+                f"--loose-group-replication-group-seeds={seeds}",
+                "--loose-group-replication-start-on-boot=OFF",
+                "--loose-group-replication-recovery-get-public-key=ON",
+                "--report-host=127.0.0.1",
+                f"--report-port={node.port}",
+                *options,
+            ]
+            self.nodes.append(node)
+
+    def start(self) -> None:
         for node in self.nodes:
-            node.kill()
+            node.launch(f"--init-file={node.folder / 'init.sql'}")
+        for node in self.nodes:
+            node.wait()
+            node.execute(
+                "CHANGE REPLICATION SOURCE TO SOURCE_USER = 'semdb_test', "
+                f"SOURCE_PASSWORD = '{self.password}' FOR CHANNEL 'group_replication_recovery'"
+            )
+        first, *others = self.nodes
+        first.execute("SET GLOBAL group_replication_bootstrap_group = ON", "START GROUP_REPLICATION")
+        first.execute("SET GLOBAL group_replication_bootstrap_group = OFF")
+        for node in others:
+            self.join(node)
+
+    def rejoin(self, node: Server) -> None:
+        node.start()
+        self.join(node)
+
+    def join(self, node: Server) -> None:
+        node.execute("START GROUP_REPLICATION")
+        state = "SELECT member_state FROM performance_schema.replication_group_members WHERE member_id = @@server_uuid"
+        _wait(node, state, ("ONLINE",))
+
+    def elect(self, node: Server) -> None:
+        """Makes a node the one that takes writes."""
+        node.execute("DO group_replication_set_as_primary(@@server_uuid)")
+
+    def primary(self, seen_by: Server) -> Server | None:
+        """The node that takes writes, as another sees it; None while there is none."""
+        query = (
+            "SELECT member_port FROM performance_schema.replication_group_members "
+            "WHERE member_role = 'PRIMARY' AND member_state = 'ONLINE'"
+        )
+        ports = seen_by.execute(query)
+        return next((node for node in self.nodes if ports == [(node.port,)]), None)
+
+
+def _wait(node: Server, query: str, row: tuple[object, ...]) -> None:
+    deadline = time.monotonic() + 60
+    while node.execute(query) != [row]:
+        if time.monotonic() > deadline:
+            raise ServerError("the node did not become one of the cluster")
+        time.sleep(0.1)
 
 
 @contextlib.contextmanager
-def cluster() -> Iterator[Cluster]:
+def galera() -> Iterator[Galera]:
     """A cluster that runs, with an empty schema ``semdb``."""
     with server_folder() as folder:
-        made = Cluster(folder)
-        try:
-            made.start()
-            made.nodes[0].make_schema()
+        folder.chmod(0o755)
+        with _started(Galera(folder)) as made:
             yield made
-        finally:
-            made.kill()
+
+
+@contextlib.contextmanager
+def group(*options: str) -> Iterator[Group]:
+    """A group that runs, with an empty schema ``semdb`` and `options` of mysqld for all nodes.
+
+    Raises ServerError where there is no MySQL.
+    """
+    with server_folder() as folder, _started(Group(folder, *options)) as made:
+        yield made
+
+
+@contextlib.contextmanager
+def _started(made: AnyCluster) -> Iterator[AnyCluster]:
+    try:
+        made.start()
+        made.nodes[0].make_schema()
+        yield made
+    finally:
+        made.kill()

@@ -66,15 +66,25 @@ def _give_up(kind: Kind, error: ServerError) -> NoReturn:
     pytest.fail(str(error), pytrace=False)
 
 
+@pytest.fixture(scope="session")
+def needs_mysql() -> None:
+    """For tests that start MySQL servers of their own."""
+    _check(MYSQL)
+
+
 @pytest.fixture(scope="module", params=[MARIADB, MYSQL], ids=lambda kind: kind.name)
 def server_kind(request: pytest.FixtureRequest) -> Kind:
     """Each kind of server in turn, for tests that start their own."""
     kind: Kind = request.param
+    _check(kind)
+    return kind
+
+
+def _check(kind: Kind) -> None:
     try:
         kind.command()
     except ServerError as error:
         _give_up(kind, error)
-    return kind
 
 
 @pytest.fixture(params=["mariadb", "mysql"])

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from sqlalchemy import URL, Connection, Engine, create_engine, event
-from sqlalchemy.engine import make_url
+from sqlalchemy.engine import ExceptionContext, make_url
 from sqlalchemy.exc import ArgumentError, DisconnectionError
 
 from semdb.database import sqlite_file
 from semdb.database.blobs import BlobCursor
-from semdb.database.hosts import HOSTS, Failover, join_hosts, split_hosts
+from semdb.database.hosts import HOSTS, Failover, is_left, join_hosts, split_hosts
 from semdb.database.tls import TLS_KEYS, tls_arguments
 from semdb.errors import DatabaseError, UsageError
 
@@ -162,6 +162,7 @@ def make_server_engine(url: URL, read_timeout_s: int | None = None) -> Engine:
 
     # Before SQLAlchemy looks at the modes, for which it would quote names.
     event.listen(engine, "connect", _configure_server, insert=True)
+    event.listen(engine, "handle_error", _leave_node)
     _limit_waiting(engine, read_timeout_s)
     return engine
 
@@ -172,11 +173,23 @@ def _configure_server(connection: Any, record: Any) -> None:
             connection._sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
     with connection.cursor() as cursor:
         cursor.execute("SET " + ", ".join(f"SESSION {name} = {value}" for name, value in _SERVER_SETTINGS.items()))
-        cursor.execute("SHOW SESSION VARIABLES WHERE Variable_name IN ('wsrep_sync_wait', 'max_allowed_packet')")
+        names = "'wsrep_sync_wait', 'group_replication_consistency', 'read_only', 'max_allowed_packet'"
+        cursor.execute(f"SHOW SESSION VARIABLES WHERE Variable_name IN ({names})")
         variables = dict(cursor.fetchall())
-        if "wsrep_sync_wait" in variables:  # reads see what this cluster has committed
+        # Reads see what this cluster has committed: here, or before this node was elected.
+        if "wsrep_sync_wait" in variables:
             cursor.execute("SET SESSION wsrep_sync_wait = 1")
+        if variables.get("group_replication_consistency") in ("EVENTUAL", "BEFORE_ON_PRIMARY_FAILOVER"):
+            level = "BEFORE" if variables.get("read_only") == "ON" else "BEFORE_ON_PRIMARY_FAILOVER"
+            cursor.execute(f"SET SESSION group_replication_consistency = '{level}'")
         record.info["max_allowed_packet"] = connection.semdb_packet = int(variables["max_allowed_packet"])
+
+
+def _leave_node(context: ExceptionContext) -> None:
+    """All connections to a node that is of no use now are given up, whatever else is in hand; see `hosts`."""
+    arguments = context.original_exception.args
+    if len(arguments) > 1 and is_left(arguments[0], str(arguments[1])):
+        context.is_disconnect = True
 
 
 def _limit_waiting(engine: Engine, read_timeout_s: int | None) -> None:

@@ -7,11 +7,14 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from sqlalchemy import Connection, Engine, text
+from sqlalchemy.exc import DBAPIError
 
 from semdb.database import retry
+from semdb.database.hosts import MEMBERS, MEMBERS_TABLE
 from semdb.shown import number
 
 OLDEST = {"MariaDB": (10, 11), "MySQL": (8, 0)}
+COLLATION = "utf8mb4_bin"
 LEAST_PACKET = 16 * 2**20
 LEAST_BUFFER = 128 * 2**20
 _VARIABLES = (
@@ -24,6 +27,7 @@ _VARIABLES = (
     "innodb_strict_mode",
     "read_only",
     "wsrep_on",
+    "group_replication_group_name",
 )
 
 
@@ -36,7 +40,7 @@ class ServerFacts:
     collation: str  # of the schema
     cipher: str  # of this connection; "" without TLS
     local: bool  # whether the connection stays on this machine
-    cluster_size: int  # nodes of a Galera cluster; 0 for a single server
+    cluster_size: int  # nodes of a Galera cluster, or members of MySQL's group; 0 for a single server
 
     @property
     def kind(self) -> str:
@@ -68,19 +72,35 @@ def server_facts(engine: Engine) -> ServerFacts:
             str(name): str(value)
             for name, value in connection.execute(text(f"SHOW SESSION VARIABLES WHERE Variable_name IN ({names})"))
         }
-        query = "SELECT default_collation_name FROM information_schema.schemata WHERE schema_name = DATABASE()"
         cipher = connection.execute(text("SHOW SESSION STATUS LIKE 'Ssl_cipher'")).first()
-        nodes = connection.execute(text("SHOW STATUS LIKE 'wsrep_cluster_size'")).first()
         return ServerFacts(
             version=str(connection.execute(text("SELECT VERSION()")).scalar()),
             variables=variables,
-            collation=str(connection.execute(text(query)).scalar()),
+            collation=collation_of(connection),
             cipher=str(cipher[1]) if cipher is not None else "",
             local=engine.url.host in (None, "localhost", "127.0.0.1", "::1"),
-            cluster_size=int(nodes[1]) if nodes is not None and variables.get("wsrep_on") == "ON" else 0,
+            cluster_size=_cluster_size(connection, variables),
         )
 
     return retry.read(engine, work)
+
+
+def _cluster_size(connection: Connection, variables: Mapping[str, str]) -> int:
+    if variables.get("wsrep_on") == "ON":
+        nodes = connection.execute(text("SHOW STATUS LIKE 'wsrep_cluster_size'")).first()
+        return int(nodes[1]) if nodes is not None else 0
+    if variables.get("group_replication_group_name"):
+        try:
+            return [state for state, _ in connection.exec_driver_sql(MEMBERS)].count("ONLINE")
+        except DBAPIError:  # not every account may
+            return 0
+    return 0
+
+
+def collation_of(connection: Connection) -> str:
+    """Which one tables of the schema have that name none."""
+    query = "SELECT default_collation_name FROM information_schema.schemata WHERE schema_name = DATABASE()"
+    return str(connection.execute(text(query)).scalar())
 
 
 def judge(facts: ServerFacts) -> Iterator[Finding]:
@@ -96,12 +116,12 @@ def judge(facts: ServerFacts) -> Iterator[Finding]:
         isolation,
         "; semdb asks each connection for REPEATABLE-READ: what lies between (a proxy?) must not change it",
     )
-    right = facts.collation == "utf8mb4_bin" and facts.variables.get("character_set_connection") == "utf8mb4"
+    right = facts.collation == COLLATION and facts.variables.get("character_set_connection") == "utf8mb4"
     yield _finding(
         right,
         "character set",
         f"schema {facts.collation}, connection {facts.variables.get('character_set_connection', '?')}",
-        "; ALTER DATABASE ... CHARACTER SET utf8mb4 COLLATE utf8mb4_bin before `semdb init`",
+        f"; run `semdb init` as the owner, or ALTER DATABASE ... CHARACTER SET utf8mb4 COLLATE {COLLATION}",
     )
     yield _tls(facts)
     if facts.variables.get("read_only") == "ON":
@@ -110,10 +130,23 @@ def judge(facts: ServerFacts) -> Iterator[Finding]:
     if 0 < buffer < LEAST_BUFFER:
         size = f"innodb_buffer_pool_size {number(buffer / 2**20)} MiB"
         yield Finding("info", "buffer pool", f"{size}; a quarter of the server's memory or more makes queries faster")
+    yield from _cluster(facts)
+
+
+def _cluster(facts: ServerFacts) -> Iterator[Finding]:
+    group = bool(facts.variables.get("group_replication_group_name"))
     if facts.cluster_size:
+        kind = "group replication" if group else "Galera"
         state = "info" if facts.cluster_size < 3 else "ok"
         yield Finding(
-            state, "cluster", f"Galera, {facts.cluster_size} nodes" + ("; 3 outlive one" if state != "ok" else "")
+            state, "cluster", f"{kind}, {facts.cluster_size} nodes" + ("; 3 outlive one" if state != "ok" else "")
+        )
+    elif group:
+        yield Finding(
+            "info",
+            "cluster",
+            "group replication, and this account cannot see whether a node is a member, so that one outside of the "
+            f"group may be written to: GRANT SELECT ON {MEMBERS_TABLE} TO it",
         )
 
 

@@ -1,11 +1,11 @@
 """The one place where a transaction is run, and run again when the database asks for it.
 
-Retried with back-off: deadlock and failed certification (1213), lock timeout (1205), lost connection (2006, 2013, also
-when a server hangs and says nothing for `READ_TIMEOUT_S`; 2003 while a server that has answered before restarts), a
-server that shuts down or has no connection left (1053, 1040), a cluster node that is not ready (1047), and a busy
-SQLite file. The work is given a fresh transaction each time, so it must not keep anything from an earlier attempt; all
-writes of semdb are idempotent, so a commit whose answer was lost is safe to repeat. What lasts longer is repeated by
-workers as whole tasks, by the same rules: `task_delay_s`.
+Retried with back-off: deadlock and failed certification (1213, 3101), lock timeout (1205), lost connection (2006, 2013,
+4031, also when a server hangs and says nothing for `READ_TIMEOUT_S`; 2003 while a server that has answered before
+restarts), a server that shuts down or has no connection left (1053, 1040), a node that is out of its cluster or takes
+no writes any more (`hosts.is_left`), and a busy SQLite file. The work is given a fresh transaction each time, so it
+must not keep anything from an earlier attempt; all writes of semdb are idempotent, so a commit whose answer was lost is
+safe to repeat. What lasts longer is repeated by workers as whole tasks, by the same rules: `task_delay_s`.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from sqlalchemy import Connection, Engine
 from sqlalchemy.exc import DBAPIError, IntegrityError, OperationalError, SQLAlchemyError
 
 from semdb.database.engine import WRITE, safe_url
+from semdb.database.hosts import HOSTS, is_left
 from semdb.database.sqlite_file import FileConnection
 from semdb.errors import DatabaseError, DatabaseUnavailableError, RecordingUnavailableError
 
@@ -32,19 +33,19 @@ ATTEMPTS = 10
 FIRST_DELAY_S = 0.05
 LONGEST_DELAY_S = 3.0
 RESTART_S = 60.0  # so long a write waits for a server that has answered before, however often it was tried
-RETRIED_CODES = frozenset({1213, 1205, 2006, 2013, 1047, 1040, 1053})
+RETRIED_CODES = frozenset({1213, 1205, 2006, 2013, 4031, 1047, 1040, 1053, 3032, 3100, 3101, 3796, 3797, 3798, 3799})
 # What a task may meet and is worth repeating later.
 MAY_HEAL = (DatabaseUnavailableError, RecordingUnavailableError)
 FIRST_TASK_DELAY_S = 2.0
 LONGEST_TASK_DELAY_S = 300.0
-_NOT_READY = {1047, 1053}
 _NO_ROOM = {3, 28, 1021, 1026, 1114}
 # Nothing listens, no such host, access denied, no such schema: trying again does not help.
 _UNREACHABLE = {2002, 2003, 2005}
-_LOST = {2006, 2013}
+_LOST = {2006, 2013, 4031}
 _DENIED = {1044, 1045, 1049, 1698, 1142, 1227}
 _READ_ONLY = {1290, 1792, 1836}  # the server, the transactions that it begins, the schema
 _LARGE_PACKET = 1153
+_SEVERAL_PRIMARIES = 3098
 _NO_TLS, _TLS_ONLY, _WRONG_ACCOUNT = 2026, 3159, 1045
 
 _NO_ROOM_ADVICE = "cannot grow: its disk, or the room that it was given, is full; make room and run the command again"
@@ -71,7 +72,7 @@ def _run(engine: Engine, work: Callable[[Connection], T], *, write: bool) -> T:
                 raise
             failure: DBAPIError = error
         except DBAPIError as error:
-            if not is_transient(error, answered=engine in _answered):
+            if not is_transient(error, answered=engine in _answered, several=HOSTS in engine.url.query):
                 raise explain(engine, error) from error
             failure = error
         except SQLAlchemyError as error:
@@ -94,10 +95,8 @@ def _once(engine: Engine, work: Callable[[Connection], T], *, write: bool) -> T:
                 found = work(connection)
             _check_untorn(connection)
             return found
-        except DBAPIError as error:
+        except DBAPIError:
             _check_untorn(connection)
-            if error_code(error) in _NOT_READY:  # another node, or this one later, over a new connection
-                connection.invalidate(error)
             raise
 
 
@@ -121,19 +120,24 @@ def error_code(error: Exception) -> int | None:
     return arguments[0] if arguments and isinstance(arguments[0], int) else None
 
 
-def is_transient(error: DBAPIError, *, answered: bool = True) -> bool:
+def is_transient(error: DBAPIError, *, answered: bool = True, several: bool = False) -> bool:
     """Whether the same transaction may succeed when it is run again.
 
-    A server that cannot be reached is a wrong URL when it has never `answered`, and else one that restarts.
+    A server that cannot be reached is a wrong URL when it has never `answered`, and else one that restarts. One that
+    takes no writes stays like this when it is the only one, and `several` elect one that does.
     """
     if _is_away(error):
         return answered
-    return error_code(error) in RETRIED_CODES or is_busy(error)
+    return error_code(error) in RETRIED_CODES or is_busy(error) or (several and _is_left(error))
 
 
 def _may_be_starting(error: DBAPIError) -> bool:
     """Whether the server is not there or not ready, as while it reads its log of changes again."""
-    return _is_away(error) or error_code(error) in _NOT_READY
+    return _is_away(error) or _is_left(error)
+
+
+def _is_left(error: DBAPIError) -> bool:
+    return is_left(error_code(error), str(error.orig))
 
 
 def _is_away(error: DBAPIError) -> bool:
@@ -162,6 +166,7 @@ def explain(
     if advice is None:
         advice = _of_server(code, attempts, setting, answered=engine in _answered)
     heals = is_busy(error) or code in _UNREACHABLE | _LOST | _NO_ROOM | RETRIED_CODES or name == "SQLITE_FULL"
+    heals = heals or is_left(code, reason)
     kind = DatabaseUnavailableError if heals else DatabaseError
     return kind(f"the database {safe_url(engine.url)} {advice} ({reason})")
 
@@ -206,6 +211,8 @@ def _of_server(code: int | None, attempts: int, setting: str, *, answered: bool)
         return f"refuses: check user, password and schema of {setting}, and the account's rights"
     if code in _READ_ONLY:
         return f"takes no writes: give {setting} the server that does, or make this one writable"
+    if code == _SEVERAL_PRIMARIES:
+        return "takes no cascading foreign keys: run its group with one primary (group_replication_single_primary_mode)"
     if code == _LARGE_PACKET:
         return "takes no statement that large: raise max_allowed_packet on the server"
     if code in _NO_ROOM:

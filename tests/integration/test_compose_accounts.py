@@ -36,7 +36,8 @@ def urls(server_kind: servers.Kind, tmp_path_factory: pytest.TempPathFactory) ->
     environment = {"PATH": f"{folder}:{os.environ['PATH']}", "OUT": str(folder), "MYSQL_ROOT_PASSWORD": "r", **given}
     script = REPOSITORY / "scripts" / "compose-accounts.sh"
     subprocess.run(["bash", str(script)], env=environment, check=True, timeout=30)
-    with servers.server(server_kind) as server:
+    options = yaml.safe_load((REPOSITORY / "docker-compose.yml").read_text())["services"]["database"]["command"]
+    with servers.server(server_kind, *options) as server:
         server.execute("DROP DATABASE semdb", *filter(None, (folder / "statements").read_text().split(";\n")))
         where = f"127.0.0.1:{server.port}/semdb"
         yield {role: f"mysql+pymysql://semdb_{role}:only4{role}@{where}" for role in ROLES}

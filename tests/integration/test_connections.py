@@ -217,6 +217,23 @@ def test_a_killed_connection_is_replaced(server_url: str) -> None:
         assert len(calls) == 2
 
 
+def test_a_connection_that_the_server_ended_while_nothing_was_asked_is_replaced(server_url: str) -> None:
+    """MySQL says so with an error of its own (4031)."""
+    engine = make_engine(server_url)
+    calls: list[int] = []
+
+    def work(connection: Connection) -> int:
+        calls.append(1)
+        if len(calls) == 1:
+            connection.execute(text("SET SESSION wait_timeout = 1"))
+            time.sleep(2.5)
+        return int(connection.execute(text("SELECT 42")).scalar_one())
+
+    assert retry.read(engine, work) == 42
+    assert len(calls) == 2
+    engine.dispose()
+
+
 def test_sqlite_writers_wait_for_each_other(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path / 'a.sqlite3'}"
     with open_store(url, create=True) as one, open_store(url) as other:

@@ -48,7 +48,7 @@ def test_the_specification_finds_a_misspelled_key(tmp_path: Path) -> None:
 def test_services_and_images(compose: dict[str, Any]) -> None:
     services = compose["services"]
     assert set(services) == {"database", "migrate", "broker", "worker"}
-    assert services["database"]["image"] == "mysql:8.4"
+    assert services["database"]["image"] == "mysql:9.7"
     assert services["migrate"]["command"] == ["semdb", "init"]
     assert services["migrate"]["restart"] == "no"  # one shot
     assert services["worker"]["command"][:3] == ["celery", "--app", "semdb.workers"]

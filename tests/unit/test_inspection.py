@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 
+import pytest
+
 from semdb.database.inspection import ServerFacts, judge
 
 GOOD = ServerFacts(
@@ -53,3 +55,14 @@ def test_the_prefix_of_old_protocols_is_not_the_version() -> None:
 def test_a_small_cluster_is_named() -> None:
     two = dataclasses.replace(GOOD, cluster_size=2)
     assert [finding.state for finding in judge(two) if finding.what == "cluster"] == ["info"]
+
+
+@pytest.mark.parametrize(
+    ("members", "state", "said"), [(3, "ok", "group replication, 3 nodes"), (0, "info", "GRANT SELECT ON")]
+)
+def test_a_group_of_mysql_is_named(members: int, state: str, said: str) -> None:
+    variables = {**GOOD.variables, "group_replication_group_name": "0000-0000"}
+    facts = dataclasses.replace(GOOD, cluster_size=members, variables=variables)
+    [finding] = [finding for finding in judge(facts) if finding.what == "cluster"]
+    assert finding.state == state
+    assert said in finding.text
