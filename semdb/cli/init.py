@@ -65,14 +65,17 @@ def _accounts(url: str, execute: bool, *, only_reader: bool) -> None:
 def _init(url: str) -> None:
     from semdb.database import schema
     from semdb.database.engine import make_engine, safe_url
+    from semdb.database.inspection import COLLATION
 
     engine = make_engine(url)
     try:
         before = schema.current_revision(engine)
-        schema.upgrade(engine)
+        collation = schema.upgrade(engine)
         where = safe_url(engine.url)
     finally:
         engine.dispose()
+    if collation is not None:
+        print_lines(f"changed the collation of the schema from {collation} to {COLLATION}, which keeps all names apart")
     if before is None:
         print_lines(f"created the schema, revision {schema.HEAD}, in {where}")
     elif before != schema.HEAD:

@@ -10,12 +10,14 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from semdb.database import retry
 from semdb.database.engine import safe_url
+from semdb.database.inspection import COLLATION, collation_of
 from semdb.database.tables import metadata
 from semdb.errors import SchemaError
 
 # Ascending; the last one is what this version of semdb reads and writes. A test compares them with the scripts.
 REVISIONS = ("0001", "0002", "0003", "0004", "0005", "0006")
 HEAD = REVISIONS[-1]
+_NOT_ALLOWED = {1044, 1142, 1227}
 
 
 def current_revision(engine: Engine) -> str | None:
@@ -47,15 +49,18 @@ def check_schema(engine: Engine) -> None:
     )
 
 
-def upgrade(engine: Engine, revision: str = HEAD) -> None:
+def upgrade(engine: Engine, revision: str = HEAD) -> str | None:
     """Create the schema, or move it up to `revision`; nothing happens when it is there already.
 
-    On SQLite all of it is one transaction. Raises SchemaError for a schema that is newer than this semdb, or holds
-    tables of something else.
+    On SQLite all of it is one transaction. On a server the schema's collation for new tables becomes binary before
+    anything is made in it; returns the one that it had, None where it was so. Raises SchemaError for a schema that is
+    newer than this semdb, or holds tables of something else, or a new one whose collation the account may not change.
     """
-    _refuse_unknown(engine)
+    before = _refuse_unknown(engine)
     _refuse_others(engine)
+    changed = None if engine.dialect.name == "sqlite" else _set_collation(engine, required=before is None)
     _alembic(engine, "upgrade", revision)
+    return changed
 
 
 def downgrade(engine: Engine, revision: str = "base") -> None:
@@ -64,10 +69,33 @@ def downgrade(engine: Engine, revision: str = "base") -> None:
     _alembic(engine, "downgrade", revision)
 
 
-def _refuse_unknown(engine: Engine) -> None:
+def _refuse_unknown(engine: Engine) -> str | None:
     revision = current_revision(engine)
     if revision is not None and revision not in REVISIONS:
         check_schema(engine)
+    return revision
+
+
+def _set_collation(engine: Engine, *, required: bool) -> str | None:
+    """Makes the schema's collation binary. Returns the former one where that was another and could be changed."""
+    found = retry.read(engine, collation_of)
+    if found == COLLATION:
+        return None
+    name = engine.dialect.identifier_preparer.quote_identifier(engine.url.database or "")
+    statement = f"ALTER DATABASE {name} CHARACTER SET utf8mb4 COLLATE {COLLATION}"
+    try:
+        with engine.connect() as connection:
+            connection.exec_driver_sql(statement.replace("%", "%%"))
+    except SQLAlchemyError as error:
+        if retry.error_code(error) not in _NOT_ALLOWED:
+            raise retry.explain(engine, error) from error
+        if not required:
+            return None  # its tables name their own; `semdb doctor` tells
+        raise SchemaError(
+            f"the schema of {safe_url(engine.url)} has the collation {found}, which takes different names for the "
+            f"same, and this account may not change it; run `{statement};` as one that may, and `semdb init` again"
+        ) from error
+    return found
 
 
 def _refuse_others(engine: Engine) -> None:

@@ -16,6 +16,8 @@ from semdb.database.store import open_store
 from tests.database_samples import fill
 from tests.servers import TestServer
 
+FOREIGN = {"mysql": "utf8mb4_0900_ai_ci", "mariadb": "utf8mb4_general_ci"}  # what CREATE DATABASE gives
+
 
 def run(*arguments: str, code: int = 0) -> Any:
     result = CliRunner().invoke(app, list(arguments))
@@ -70,3 +72,46 @@ def test_doctor_names_the_server_and_a_missing_schema(
     assert "there is no semdb schema" in problems[0]
     run("init")
     assert "answers: server" in run("doctor").stdout
+
+
+def test_the_collation_of_a_schema_becomes_binary(database_server: TestServer, server_url: str) -> None:
+    """As a schema has it that was made by CREATE DATABASE alone."""
+    name, foreign = make_url(server_url).database, FOREIGN[database_server.kind]
+    database_server.execute(f"ALTER DATABASE `{name}` CHARACTER SET utf8mb4 COLLATE {foreign}")
+    first, second = run("init", "--database-url", server_url).stdout.splitlines()
+    assert first.startswith(f"changed the collation of the schema from {foreign} to utf8mb4_bin, ")
+    assert second.startswith("created the schema")
+    assert _collations(database_server, str(name)) == {"utf8mb4_bin"}
+    assert run("init", "--database-url", server_url).stdout.startswith("the schema of ")
+
+
+def test_a_collation_that_may_not_be_changed_is_refused_before_anything_is_made(
+    database_server: TestServer, server_url: str
+) -> None:
+    name, foreign = make_url(server_url).database, FOREIGN[database_server.kind]
+    alter = f"ALTER DATABASE `{name}` CHARACTER SET utf8mb4 COLLATE "
+    database_server.execute(alter + foreign, "CREATE USER 'bound'@'127.0.0.1' IDENTIFIED BY 'x'")
+    try:
+        rights = "SELECT, INSERT, UPDATE, DELETE, CREATE, DROP, INDEX, REFERENCES, CREATE VIEW, SHOW VIEW"  # no ALTER
+        database_server.execute(f"GRANT {rights} ON `{name}`.* TO 'bound'@'127.0.0.1'")
+        bound = make_url(server_url).set(username="bound", password="x").render_as_string(hide_password=False)
+        refused = " ".join(run("init", "--database-url", bound, code=1).stderr.split())
+        assert f"has the collation {foreign}, which takes different names for the same" in refused
+        assert f"run `{alter}utf8mb4_bin;` as one that may, and `semdb init` again" in refused
+        assert database_server.execute(f"SHOW TABLES IN `{name}`") == []
+        run("init", "--database-url", server_url)
+        database_server.execute(alter + foreign)  # its tables name their own
+        assert "is up to date" in run("init", "--database-url", bound).stdout
+    finally:
+        database_server.execute("DROP USER 'bound'@'127.0.0.1'")
+
+
+def _collations(server: TestServer, name: str) -> set[object]:
+    """Of a schema and of all text in its tables."""
+    schema = f"SELECT default_collation_name FROM information_schema.schemata WHERE schema_name = '{name}'"
+    columns = (
+        "SELECT DISTINCT c.collation_name FROM information_schema.columns c JOIN information_schema.tables t "
+        "USING (table_schema, table_name) WHERE c.collation_name IS NOT NULL AND t.table_type = 'BASE TABLE' "
+        f"AND c.table_schema = '{name}'"
+    )
+    return {row[0] for query in (schema, columns) for row in server.execute(query)}
