@@ -24,7 +24,7 @@ ready && exit 0
 for program in apt-get apt-cache dpkg flock; do
   command -v "$program" >/dev/null || give_up "it is unpacked with $program, which is not here"
 done
-mkdir -p "$prefix" 2>/dev/null || give_up "$prefix cannot be made"
+mkdir -p "$(dirname "$prefix")" 2>/dev/null || give_up "$prefix cannot be made"
 exec 9>"$prefix.lock"
 flock 9 # two checkouts, or two runs, share it
 ready && exit 0
@@ -37,6 +37,7 @@ log="$work/log"
 options=(
   -o Dir::State="$work/apt" -o Dir::State::Lists="$work/apt/lists" -o Dir::State::status="$work/apt/status"
   -o Dir::Cache="$work/apt/cache" -o APT::Sandbox::User= -o APT::Install-Recommends=false
+  -o Acquire::Retries=3
 )
 . /etc/os-release
 if [ "${ID:-}" = debian ]; then
@@ -45,10 +46,11 @@ if [ "${ID:-}" = debian ]; then
   keys=$(find /usr/share/keyrings -name 'debian-archive-keyring.[gp][gp][gp]' 2>/dev/null | sed -n 1p)
   echo "deb ${keys:+[signed-by=$keys] }$archive unstable main" >"$work/apt/sources.list"
   options+=(-o Dir::Etc::SourceList="$work/apt/sources.list" -o Dir::Etc::SourceParts=/dev/null)
+  options+=(-o APT::Update::Error-Mode=any) # what cannot be fetched is an error, not a warning
 fi
 
 echo "fetching MySQL for the tests (60 MB) into $prefix"
-apt-get "${options[@]}" update >"$log" 2>&1 || give_up "apt-get update failed: $(tail -n 1 "$log")"
+apt-get "${options[@]}" update >"$log" 2>&1 || give_up "apt-get update failed: $(grep '^E:' "$log" | sed -n 1p)"
 package=$(apt-cache "${options[@]}" search --names-only '^mysql-server-core(-[0-9.]+)?$' 2>/dev/null | cut -d' ' -f1 | sort -V | tail -n 1)
 [ -n "$package" ] || give_up "the archive has no mysql-server-core for $(dpkg --print-architecture)"
 version=$(apt-cache "${options[@]}" show "$package" | awk '$1 == "Version:" {print $2}' | sed -n 1p)
@@ -85,7 +87,7 @@ mkdir "$work/tree/data"
 "$work/tree/mysqld" --initialize-insecure "--user=$(id -un)" "--datadir=$work/tree/data" --innodb-autoextend-increment=8 \
   --innodb-redo-log-capacity=32M --innodb-doublewrite=OFF >"$log" 2>&1 || give_up "MySQL $version does not start here: $(tail -n 1 "$log")"
 rm "$work/tree/data/auto.cnf" # each server has a name of its own
-if ! rmdir "$prefix" 2>/dev/null; then
+if [ -e "$prefix" ] && ! rmdir "$prefix" 2>/dev/null; then
   grep -qs 'written by install-mysql.sh' "$prefix/mysqld" || give_up "$prefix holds something else"
   rm -rf "$prefix" # one that does not start any more
 fi

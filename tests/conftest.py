@@ -54,16 +54,16 @@ def mysql_server() -> Iterator[TestServer]:
 def _running(kind: Kind) -> Iterator[TestServer]:
     with contextlib.ExitStack() as stack:
         try:
-            server = stack.enter_context(server_for_tests(kind))
+            server: TestServer | str = stack.enter_context(server_for_tests(kind))
         except ServerError as error:
-            _give_up(kind, error)
-        yield server
+            server = str(error)
+        yield server if isinstance(server, TestServer) else _give_up(kind, server)
 
 
-def _give_up(kind: Kind, error: ServerError) -> NoReturn:
+def _give_up(kind: Kind, reason: str) -> NoReturn:
     if kind is MYSQL and os.environ.get("SEMDB_TEST_REQUIRE_MYSQL", "0") in ("", "0"):
-        pytest.skip(str(error))
-    pytest.fail(str(error), pytrace=False)
+        pytest.skip(reason)
+    pytest.fail(reason, pytrace=False)
 
 
 @pytest.fixture(scope="session")
@@ -83,8 +83,10 @@ def server_kind(request: pytest.FixtureRequest) -> Kind:
 def _check(kind: Kind) -> None:
     try:
         kind.command()
+        return
     except ServerError as error:
-        _give_up(kind, error)
+        reason = str(error)
+    _give_up(kind, reason)
 
 
 @pytest.fixture(params=["mariadb", "mysql"])
