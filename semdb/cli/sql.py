@@ -74,6 +74,7 @@ def run_text(settings: Settings, text: str, where: str, fmt: Format) -> None:
     Raises UsageError for a text without any, and for several whose rows are to be CSV or JSON; an error of a statement
     names its line.
     """
+    from semdb.cli.output import print_lines
     from semdb.cli.sql_text import statements
     from semdb.errors import SemdbError, UsageError
 
@@ -84,7 +85,7 @@ def run_text(settings: Settings, text: str, where: str, fmt: Format) -> None:
         raise UsageError(f"{where}: {len(found)} statements; --format {fmt} takes one, since its rows are one list")
     for number, statement in enumerate(found):
         if number:
-            print()
+            print_lines("")
         try:
             run(settings, statement.text, fmt)
         except SemdbError as error:

@@ -48,10 +48,10 @@ class Prompt:
                 try:
                     text = self._read()
                 except EOFError:
-                    print()
+                    print_lines("")
                     return
                 except KeyboardInterrupt:
-                    print()
+                    print_lines("")
                     continue
                 if text.strip().lower().rstrip(";").strip() in ("\\q", "quit", "exit"):
                     return
@@ -70,7 +70,7 @@ class Prompt:
             try:
                 lines.append(input(NEXT))
             except EOFError:
-                print()
+                print_lines("")
                 break
         return "\n".join(lines)
 
@@ -80,7 +80,7 @@ class Prompt:
     def _answer(self, text: str) -> None:
         command, _, argument = text.strip().partition(" ")
         if command in ("?", "help", "\\?", "\\h"):
-            print(HELP)
+            print_lines(*HELP.splitlines())
         elif command == "\\d":
             self._describe(argument.strip(" ;"))
         elif command == "\\f":
@@ -107,7 +107,7 @@ class Prompt:
         count = f"{len(shown)} row{'' if len(shown) == 1 else 's'}"
         if more:
             count = f"the first {MOST_ROWS} rows of more: narrow it, or semdb sql --file prints all"
-        print(f"({count}, {seconds:.2f} s)")
+        print_lines(f"({count}, {seconds:.2f} s)")
 
     def _describe(self, name: str) -> None:
         if not name:
@@ -164,7 +164,7 @@ def _told() -> Iterator[None]:
     except SemdbError as error:
         print_lines(f"semdb: {error}")
     except KeyboardInterrupt:
-        print("semdb: interrupted")
+        print_lines("semdb: interrupted")
 
 
 @contextlib.contextmanager
