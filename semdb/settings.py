@@ -91,6 +91,9 @@ class Settings(BaseSettings):
     descriptor_dtype: Literal["float32", "float16"] = Field(
         "float32", description="how descriptors of float are stored; float16 takes half the room"
     )
+    check_recordings: bool = Field(
+        True, description="an ingest looks first whether a recording's images fit what it says of itself"
+    )
     sql_time_limit_s: float = Field(60.0, gt=0, description="time limit of `semdb sql`")
 
     @field_validator("broker_url")

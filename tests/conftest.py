@@ -21,6 +21,7 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 # What a developer has set is not what is tested; commands that are cut off hear Ctrl-C, also below `nohup ... &`.
 for _name in [name for name in os.environ if name.startswith("SEMDB_") and not name.startswith("SEMDB_TEST_")]:
     del os.environ[_name]
+os.environ["SEMDB_CHECK_RECORDINGS"] = "false"  # a second for each ingest; tests of the check say otherwise
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 

@@ -36,14 +36,15 @@ def ingest_options(
     camera: CameraLike | None,
     reading: ReadOptions | None,
     depth_scale: float | None = None,
+    *,
+    check: bool = True,
 ) -> IngestOptions:
     """The options of an ingest. Raises UsageError for a camera or scale that is none."""
     reading = reading or AS_THE_FORMAT_SAYS
     if depth_scale is not None:
         reading = replace(reading, depth_scale=check_depth_scale(depth_scale))
-    return IngestOptions(
-        map_name, name, keyframes, stride, None if camera is None else camera_text(camera), reading=reading
-    )
+    text = None if camera is None else camera_text(camera)
+    return IngestOptions(map_name, name, keyframes, stride, text, reading, check=check)
 
 
 @contextmanager

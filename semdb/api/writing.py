@@ -33,6 +33,7 @@ class Writing(Reading):
         camera: CameraLike | None = None,
         reading: ReadOptions | None = None,
         depth_scale: float | None = None,
+        check: bool = True,
         progress: Progress | None = None,
     ) -> list[IngestSummary]:
         """Selects keyframes, describes and stores them; running it again adds nothing, cut off it goes on.
@@ -41,16 +42,17 @@ class Writing(Reading):
         go to a temporary folder as they come, are one recording, and need its `name`. `keyframes` takes that many,
         those with the least common view, `stride` every stride-th frame, neither as many as it takes. `camera` and
         `reading` say of folders what their files do not. `depth_scale` is units per metre of depth files, or of those
-        that are made of depth in memory (5000). `progress` is told what, done and total (0: not known). Makes a SQLite
-        file that is not there. Returns one summary per recording.
+        that are made of depth in memory (5000). `check` compares poses, depth, intrinsics and clocks with a sample of
+        the images first. `progress` is told what, done and total (0: not known). Makes a SQLite file that is not there.
+        Returns one summary per recording.
 
-        Raises RecordingError for what cannot be used at all, UsageError where models or plan contradict what is stored,
-        ModelError, DatabaseError.
+        Raises RecordingError for what cannot be used at all or is certainly read wrongly, UsageError where models or
+        plan contradict what is stored, ModelError, DatabaseError.
         """
         from semdb.api.sources import ingest_options, open_source
         from semdb.ingestion.run import ingest_opened
 
-        options = ingest_options(map, name, keyframes, stride, camera, reading, depth_scale)
+        options = ingest_options(map, name, keyframes, stride, camera, reading, depth_scale, check=check)
         with open_source(source, self.settings, options, progress, self._check_ingest) as recordings:
             store = self._store(create=True)
             with self._here.describers() as describers:
@@ -75,13 +77,14 @@ class Writing(Reading):
         stride: int | None = None,
         camera: CameraLike | None = None,
         reading: ReadOptions | None = None,
+        check: bool = True,
         progress: Progress | None = None,
     ) -> list[IngestSummary]:
         """Plans recordings and sends their keyframes to workers by `send` (`semdb.workers.send_items`)."""
         from semdb.api.sources import ingest_options
         from semdb.ingestion.queue import queue_recordings
 
-        options = ingest_options(map, name, keyframes, stride, camera, reading)
+        options = ingest_options(map, name, keyframes, stride, camera, reading, check=check)
         return queue_recordings(
             [str(path) for path in paths],
             self.settings,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, cast
 
@@ -41,6 +42,10 @@ def command(
         str | None,
         typer.Option("--batch", metavar="N", help="Images at once through the networks; over SEMDB_BATCH."),
     ] = None,
+    no_check: Annotated[
+        bool,
+        typer.Option("--no-check", help="Do not look first whether images fit what the recording says of itself."),
+    ] = False,
     queue: Annotated[
         bool, typer.Option("--queue", help="Plan here, and let workers do it: see semdb.workers.")
     ] = False,
@@ -80,9 +85,7 @@ def command(
         return
     if not paths:
         raise UsageError("name the folder of a recording: semdb ingest PATH (or --resume for what workers have left)")
-    options = IngestOptions(
-        map_name=map_name, name=name, keyframes=keyframes, stride=stride, camera=camera, reading=reading
-    )
+    options = IngestOptions(map_name, name, keyframes, stride, camera, reading, check=not no_check)
     with StagedProgress() as progress, ends_when_told():
         if queue:
             summaries = queue_recordings(paths, settings, options, _send(), progress=progress.update, say=say)
@@ -150,6 +153,7 @@ def as_json(summary: IngestSummary) -> dict[str, object]:
         "dropped": [{"name": dropped.name, "reason": dropped.reason} for dropped in summary.dropped],
         "models": {model.role: model.name for model in summary.models},
         "notes": list(summary.notes),
+        "findings": [asdict(finding) for finding in summary.findings],
         "seconds": summary.seconds or None,
     }
 

@@ -81,7 +81,7 @@ _READING = {
     "quaternion": _reading("--quaternion", "ORDER", "Order of the numbers of quaternions: xyzw or wxyz."),
     "time_offset_ms": _reading("--time-offset-ms", "MS", "Added to the times of poses to get those of colour."),
     "depth_offset_ms": _reading("--depth-offset-ms", "MS", "Added to the times of depth to get those of colour."),
-    "scale": _reading("--scale", "N", "Metres per unit of poses, where the format has none."),
+    "scale": _reading("--scale", "N", "Metres per unit of poses."),
     "color_topic": _reading("--color-topic", "TOPIC", "Colour images of a ROS bag."),
     "depth_topic": _reading("--depth-topic", "TOPIC", "Depth images of a ROS bag."),
     "info_topic": _reading("--info-topic", "TOPIC", "camera_info of the colour camera of a ROS bag."),

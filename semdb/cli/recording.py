@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,6 +15,7 @@ from semdb.shown import measure, number
 
 if TYPE_CHECKING:
     from semdb.recordings import DroppedFrame, Recording
+    from semdb.recordings.check import Report
     from semdb.types import Camera
 
 NAMES_SHOWN = 3
@@ -27,6 +29,10 @@ def command(
     quick: Annotated[
         bool, typer.Option("--quick", help="Do not decode every image; look at headers and file ends only.")
     ] = False,
+    check: Annotated[
+        bool,
+        typer.Option("--check", help="Compare poses, depth, intrinsics, clocks with the images; 1 if wrong."),
+    ] = False,
     json: JsonFlag = False,
 ) -> None:
     """Say what a recording holds and which frames cannot be used.
@@ -37,14 +43,42 @@ def command(
     from semdb.recordings import open_recordings, parse_camera
 
     recordings = open_recordings(path, None if camera is None else parse_camera(camera), reading)
-    if not quick:
+    if not quick and not check:
         for recording in recordings:
             decode_all(recording)
+    reports = [look(recording) if check else None for recording in recordings]
     if json:
-        print_json([as_json(recording, quick) for recording in recordings])
-        return
-    for position, recording in enumerate(recordings):
-        print_lines(*[""] * (position > 0), *as_lines(recording, quick))
+        print_json([as_json(r, quick or check, report) for r, report in zip(recordings, reports, strict=True)])
+    else:
+        for position, (recording, report) in enumerate(zip(recordings, reports, strict=True)):
+            print_lines(*[""] * (position > 0), *as_lines(recording, quick or check), *check_lines(report))
+    if any(finding.certain for report in reports if report is not None for finding in report.findings):
+        raise typer.Exit(1)
+
+
+def look(recording: Recording) -> Report:
+    """Compares what the recording says of itself with its images."""
+    from semdb.cli.progress import Progress
+    from semdb.recordings.check import check_recording
+
+    with Progress(f"checking {recording.name}") as progress:
+        return check_recording(recording, progress=progress.update)
+
+
+def check_lines(report: Report | None) -> list[str]:
+    """What `--check` adds for people."""
+    if report is None:
+        return []
+    rows = [("checked", f"{report.pairs} pairs of frames")]
+    if report.error_px == report.error_px:
+        rows[0] = ("checked", f"{rows[0][1]}; matches are {report.error_px:.1f} px of 640 off")
+    rows += [("", note) for note in report.notes]
+    for finding in report.findings:
+        mend = f"; {finding.option}" if finding.option else ""
+        rows.append(("certain" if finding.certain else "likely", f"{finding.message}{mend}"))
+    if not report.findings:
+        rows.append(("", "nothing contradicts the images"))
+    return [f"{label:<12} {text}" for label, text in rows]
 
 
 def decode_all(recording: Recording) -> None:
@@ -75,7 +109,7 @@ def counts(recording: Recording) -> dict[str, int]:
     }
 
 
-def as_json(recording: Recording, quick: bool) -> dict[str, Any]:
+def as_json(recording: Recording, quick: bool, report: Report | None = None) -> dict[str, Any]:
     """What `--json` prints for one recording."""
     camera = recording.camera
     return {
@@ -103,7 +137,19 @@ def as_json(recording: Recording, quick: bool) -> dict[str, Any]:
         "trajectory_length_m": recording.trajectory_length(),
         "notes": list(recording.notes),
         "contents": list(recording.contents),
+        **({} if report is None else check_json(report)),
         "assumed": list(recording.assumed),
+    }
+
+
+def check_json(report: Report) -> dict[str, Any]:
+    """What `--check --json` adds; errors are in pixels of an image of 640, null where they are not known."""
+    return {
+        "findings": [asdict(finding) for finding in report.findings],
+        "checked_pairs": report.pairs,
+        "error_px": report.error_px,
+        "floor_px": report.floor_px,
+        "not_checked": list(report.notes),
     }
 
 

@@ -117,6 +117,17 @@ class RecordingStatus:
 
 
 @dataclass(frozen=True, slots=True)
+class RecordingFinding:
+    """What a recording's images contradict: `value` is what fits, `option` what would mend it."""
+
+    kind: str
+    certain: bool
+    value: str
+    option: str
+    message: str
+
+
+@dataclass(frozen=True, slots=True)
 class FailedItem:
     recording_id: int
     frame_index: int

@@ -102,6 +102,16 @@ recordings = _table(
     UniqueConstraint("map_id", "name"),
 )
 
+recording_findings = _table(
+    "recording_findings",
+    _ref("recording_id", "recordings.id", primary_key=True),
+    Column("kind", String(32), primary_key=True),
+    Column("certain", Integer, nullable=False),
+    Column("value", String(NAME_LENGTH), nullable=False),
+    Column("fix", String(NAME_LENGTH), nullable=False),
+    Column("message", LongText, nullable=False),
+)
+
 cameras = _table(
     "cameras",
     _id(),

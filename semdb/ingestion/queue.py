@@ -22,6 +22,8 @@ from semdb.ingestion.run import (
     IngestSummary,
     Progress,
     fingerprint,
+    keep_findings,
+    look_first,
     make_describers,
     map_models_of,
     open_all,
@@ -65,10 +67,12 @@ def queue_recordings(
             for note in (*recording.said, *specs.notes):
                 if say is not None:
                     say(f"{recording.name}: {note}")
+            warnings = look_first(recording, opened, settings, options, progress, say)
             one = settings_of_map(settings, known).model_copy(update={"threads": 1})
             models = make_describers(specs, one)[0].models
             summary, _ = plan_ingest(recording, opened, models, options, progress=progress)
             summary.notes = (*recording.said, *specs.notes)
+            keep_findings(opened, summary, warnings)
             requeue_failed(opened.engine, summary.recording_id)
             sweep(opened, send, recording_id=summary.recording_id)
             opened.finish_recording(summary.recording_id)

@@ -13,11 +13,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from semdb.database import items
+from semdb.database.findings import write_findings
 from semdb.database.planning import check_models
-from semdb.database.records import PlannedRecording, RecordingPlan
+from semdb.database.records import PlannedRecording, RecordingFinding, RecordingPlan
 from semdb.database.requeue import requeue_failed
 from semdb.database.store import Store, open_store
 from semdb.errors import UsageError
+from semdb.ingestion.contradictions import check_before_ingest
 from semdb.ingestion.keyframes import select_keyframes
 from semdb.ingestion.work import STAGES, Item, log_item, work_off
 from semdb.perception.describe import Describer, describer_from_specs
@@ -40,7 +42,8 @@ class IngestOptions:
     """`keyframes` and `stride` as in `ingestion.keyframes.select_keyframes`; `name` overrides the recording's own.
 
     `map_name` None gives each recording the map of `default_map_name`. `camera` is the text of ``--camera``,
-    `reading` says of the files what they do not say; `descriptor_dtype` is how descriptors of float are stored.
+    `reading` says of the files what they do not say, `check` whether that is compared with the images first;
+    `descriptor_dtype` is how descriptors of float are stored.
     """
 
     map_name: str | None = None
@@ -49,6 +52,7 @@ class IngestOptions:
     stride: int | None = None
     camera: str | None = None
     reading: ReadOptions = AS_THE_FORMAT_SAYS
+    check: bool = True
     descriptor_dtype: str = "float32"
 
     def map_of(self, recording: Recording) -> str:
@@ -79,6 +83,7 @@ class IngestSummary:
     failed: dict[int, str] = field(default_factory=dict)
     dropped: tuple[DroppedFrame, ...] = ()
     notes: tuple[str, ...] = ()
+    findings: tuple[RecordingFinding, ...] = ()
     seconds: dict[str, float] = field(default_factory=dict)
 
 
@@ -123,8 +128,10 @@ def ingest_opened(
         specs, own = describers_for(options.map_of(recording), has_masks, store, settings, describers)
         for note in (*recording.said, *specs.notes):
             (say or _nobody)(f"{recording.name}: {note}")
+        warnings = look_first(recording, store, settings, options, progress, say)
         summary = ingest_recording(recording, store, own, options, progress=progress)
         summary.notes = (*recording.said, *specs.notes)
+        keep_findings(store, summary, warnings)
         summaries.append(summary)
     return summaries
 
@@ -143,6 +150,36 @@ def describers_for(
     if key not in known:
         known[key] = make_describers(specs, own)
     return specs, known[key]
+
+
+def look_first(
+    recording: Recording,
+    store: Store,
+    settings: Settings,
+    options: IngestOptions,
+    progress: Progress | None,
+    say: Callable[[str], None] | None,
+) -> list[RecordingFinding] | None:
+    """What is likely wrong with how a recording is read (said); None where it was not looked at.
+
+    One that is planned already was looked at then. Raises RecordingError for what is certainly wrong.
+    """
+    if not (options.check and settings.check_recordings):
+        return None
+    if store.planned_frames(options.map_of(recording), recording.name):
+        return None
+    findings = check_before_ingest(recording, progress)
+    for finding in findings:
+        mend = f"; {finding.option} would mend it" if finding.option else ""
+        (say or _nobody)(f"{recording.name}: likely: {finding.message}{mend}")
+    return findings
+
+
+def keep_findings(store: Store, summary: IngestSummary, findings: Sequence[RecordingFinding] | None) -> None:
+    """Writes the findings of a recording that was looked at."""
+    if findings:
+        write_findings(store.engine, summary.recording_id, findings)
+        summary.findings = tuple(findings)
 
 
 def open_all(paths: Sequence[Path | str], settings: Settings, options: IngestOptions) -> list[Recording]:

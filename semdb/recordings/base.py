@@ -20,7 +20,7 @@ from semdb.recordings.images import (
     read_bytes,
     scaled_depth,
 )
-from semdb.recordings.options import ReadOptions
+from semdb.recordings.options import AS_THE_FORMAT_SAYS, ReadOptions
 from semdb.recordings.registration import depth_size, register_depth
 from semdb.types import Camera, Float32Array, FloatArray, Frame, ImageArray, InstanceMasks
 
@@ -109,6 +109,8 @@ class Recording:
     categories: Mapping[int, str] | None = None
     source: str = ""  # what the database keeps of where it came from; "": the folder
     data: FrameData | None = None  # where images are no files of their own
+    reading: ReadOptions = AS_THE_FORMAT_SAYS  # what was said by hand of how it is to be read
+    takes: frozenset[str] = frozenset()  # the options that mean something to its format
     contents: tuple[str, ...] = ()  # what else the file holds and what is taken of it, a line each for people
     decode_failures: list[DroppedFrame] = field(default_factory=list)
     _failed: set[str] = field(default_factory=set)  # names of those

@@ -161,5 +161,5 @@ LAYOUT = Layout(
     "ICL-NUIM (associations.txt, *.gt.freiburg)",
     is_icl_nuim,
     lambda path, camera, options: [open_icl_nuim(path, camera, options)],
-    frozenset({"depth_scale", "poses_are", "axes", "quaternion"}),
+    frozenset({"depth_scale", "poses_are", "axes", "scale", "quaternion"}),
 )

@@ -84,7 +84,6 @@ def open_kapture(path: Path, camera: Camera | None = None, options: ReadOptions 
             continue
         if pose is not None:
             pose = options.pose(pose)
-            pose[:3, 3] *= options.scale or 1.0
         source = _depth_of(record, by_time.get(record.time, ()), sensors, rigs)
         if usable and source is None:
             dropped.append(DroppedFrame(record.path, "no depth of the same time"))

@@ -59,7 +59,10 @@ def open_with(layout: Layout, path: Path, camera: Camera | None, options: ReadOp
         raise UsageError(f"{path}: {names} means nothing to a recording of format {layout.name}; it takes {fitting}")
     if options.depth_scale is not None and (problem := depth_scale_problem(options.depth_scale)):
         raise UsageError(f"--depth-scale: {problem}")
-    return layout.open(path, camera, options)
+    found = layout.open(path, camera, options)
+    for recording in found:
+        recording.reading, recording.takes = options, layout.takes
+    return found
 
 
 def not_a_recording(path: Path) -> RecordingError:

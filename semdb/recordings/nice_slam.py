@@ -108,5 +108,5 @@ LAYOUT = Layout(
     "Replica as NICE-SLAM has it (results/frameXXXXXX.jpg, traj.txt)",
     is_nice_slam,
     lambda path, camera, options: [open_nice_slam(path, camera, options)],
-    frozenset({"depth_scale", "poses_are", "axes"}),
+    frozenset({"depth_scale", "poses_are", "axes", "scale"}),
 )

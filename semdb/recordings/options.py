@@ -10,7 +10,7 @@ from urllib.parse import quote, unquote
 import numpy as np
 
 from semdb.errors import UsageError
-from semdb.geometry import invert_pose
+from semdb.geometry import invert_pose, pose_from
 from semdb.types import FloatArray
 
 WORLD_FROM_CAMERA, CAMERA_FROM_WORLD = "world_from_camera", "camera_from_world"
@@ -28,7 +28,7 @@ class ReadOptions:
 
     `depth_scale` is units per metre of depth files. `poses_are` and `axes` say what the poses in the files are of,
     `quaternion` in which order they have their numbers. `time_offset_ms` is added to the times of poses,
-    `depth_offset_ms` to those of depth, to get those of colour. `scale` is metres per unit of poses that have none.
+    `depth_offset_ms` to those of depth, to get those of colour. `scale` is metres per unit of poses.
     Topics and frames are of ROS bags.
     """
 
@@ -68,12 +68,16 @@ class ReadOptions:
     def pose(self, pose: FloatArray) -> FloatArray:
         """``world_from_camera`` ``[4, 4]`` of an OpenCV camera from a pose as the files have it."""
         found = invert_pose(pose) if self.poses_are == CAMERA_FROM_WORLD else pose
-        return found if self.axes is None else np.asarray(found @ AXES[self.axes])
+        if self.axes is not None:
+            found = np.asarray(found @ AXES[self.axes])
+        if self.scale is not None:
+            found = pose_from(found[:3, :3], found[:3, 3] * self.scale)
+        return found
 
     @property
     def changes_poses(self) -> bool:
         """Whether `pose` does anything."""
-        return self.poses_are != WORLD_FROM_CAMERA or self.axes not in (None, "opencv")
+        return self.poses_are != WORLD_FROM_CAMERA or self.axes not in (None, "opencv") or self.scale is not None
 
 
 def option_of(name: str) -> str:

@@ -157,5 +157,5 @@ LAYOUT = Layout(
     "Polycam's raw data (keyframes/)",
     is_polycam,
     lambda path, camera, options: [open_polycam(path, camera, options)],
-    frozenset({"depth_scale", "poses_are", "axes"}),
+    frozenset({"depth_scale", "poses_are", "axes", "scale"}),
 )

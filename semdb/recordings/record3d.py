@@ -247,7 +247,7 @@ def _pose(poses: Any, number: int, options: ReadOptions) -> FloatArray | str:
         pose = pose_from(rotation_from_quat_wxyz(quat_wxyz), translation)
     except ValueError as error:
         return f"its pose {error}"
-    return options.pose(pose) if options.axes else np.asarray(options.pose(pose) @ BACK)
+    return options.pose(pose) if options.axes else options.pose(pose) @ BACK
 
 
 def _time_ns(times: Any, fps: Any, number: int) -> int | None:
@@ -265,5 +265,5 @@ LAYOUT = Layout(
     "Record3D (.r3d, or its folder with metadata and rgbd/)",
     is_record3d,
     lambda path, camera, options: [open_record3d(path, camera, options)],
-    frozenset({"poses_are", "axes", "quaternion"}),
+    frozenset({"poses_are", "axes", "scale", "quaternion"}),
 )

@@ -136,5 +136,5 @@ LAYOUT = Layout(
     "Open3D and Redwood (color/, depth/, intrinsic.json, *.log)",
     is_redwood,
     lambda path, camera, options: [open_redwood(path, camera, options)],
-    frozenset({"depth_scale", "poses_are", "axes"}),
+    frozenset({"depth_scale", "poses_are", "axes", "scale"}),
 )

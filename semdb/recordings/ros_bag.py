@@ -329,6 +329,7 @@ LAYOUT = Layout(
             "depth_scale",
             "poses_are",
             "axes",
+            "scale",
             "time_offset_ms",
             "depth_offset_ms",
             "color_topic",

@@ -390,5 +390,5 @@ LAYOUT = Layout(
     "RTAB-Map (.db)",
     is_rtabmap,
     lambda path, camera, options: [open_rtabmap(path, camera, options)],
-    frozenset({"depth_scale", "poses_are", "axes"}),
+    frozenset({"depth_scale", "poses_are", "axes", "scale"}),
 )

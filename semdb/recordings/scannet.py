@@ -323,7 +323,7 @@ def _size_of(entries: list[FrameEntry], files: list[Path]) -> tuple[int, int]:
     raise RecordingError(f"no image of {len(entries)} can be read: {reason}")
 
 
-_TAKES = frozenset({"depth_scale", "poses_are", "axes"})
+_TAKES = frozenset({"depth_scale", "poses_are", "axes", "scale"})
 SENS = Layout(
     "scannet", "ScanNet (.sens)", is_sens, lambda path, camera, options: [open_sens(path, camera, options)], _TAKES
 )

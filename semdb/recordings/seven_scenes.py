@@ -151,5 +151,5 @@ LAYOUT = Layout(
     "7-Scenes (frame-XXXXXX.color.png, or folders seq-XX of them)",
     lambda path: path.is_dir() and (is_seven_scenes(path) or bool(find_sequences(path))),
     _open,
-    frozenset({"depth_scale", "poses_are", "axes"}),
+    frozenset({"depth_scale", "poses_are", "axes", "scale"}),
 )

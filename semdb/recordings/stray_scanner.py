@@ -140,5 +140,5 @@ LAYOUT = Layout(
     "Stray Scanner (rgb.mp4, odometry.csv, depth/)",
     is_stray_scanner,
     lambda path, camera, options: [open_stray_scanner(path, camera, options)],
-    frozenset({"depth_scale", "poses_are", "axes", "quaternion"}),
+    frozenset({"depth_scale", "poses_are", "axes", "scale", "quaternion"}),
 )

@@ -208,5 +208,5 @@ LAYOUT = Layout(
     "TUM RGB-D (rgb.txt, depth.txt, groundtruth.txt)",
     is_tum,
     lambda path, camera, options: [open_tum(path, camera, options)],
-    frozenset({"depth_scale", "poses_are", "axes", "quaternion", "time_offset_ms", "depth_offset_ms"}),
+    frozenset({"depth_scale", "poses_are", "axes", "scale", "quaternion", "time_offset_ms", "depth_offset_ms"}),
 )
