@@ -43,6 +43,10 @@ class DatabaseUnavailableError(DatabaseError):
     """The database does not answer or has no room now; the same work may succeed later."""
 
 
+class UnstorableError(DatabaseError):
+    """A value that no attempt will store: larger than the server takes, or than its column holds."""
+
+
 class LeaseLostError(DatabaseError):
     """Another worker has taken over what this one was working on: nothing was written."""
 

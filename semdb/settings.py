@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Literal
@@ -44,6 +46,17 @@ def check_broker_url(url: str) -> str:
         if scheme in ("redis", "rediss") and parsed.path.strip("/") and not parsed.path.strip("/").isdigit():
             raise BrokerUrlError("SEMDB_BROKER_URL: a database of Redis is a number: redis://HOST:PORT/N")
     return url
+
+
+def split_roots(text: str) -> tuple[str, ...]:
+    """Absolute folders and URLs, divided as in PATH; the colon of a URL divides nothing. Raises ValueError."""
+    roots = tuple(root for root in re.split(rf"{os.pathsep}(?!//)", text) if root.strip())
+    if not roots:
+        raise ValueError("names no folder: name one, or unset it to allow all")
+    for root in roots:
+        if not os.path.isabs(root) and "://" not in root:
+            raise ValueError(f"{root!r} is neither an absolute folder nor a URL")
+    return roots
 
 
 class Settings(BaseSettings):
@@ -94,7 +107,22 @@ class Settings(BaseSettings):
     check_recordings: bool = Field(
         True, description="an ingest looks first whether a recording's images fit what it says of itself"
     )
+    recording_roots: str | None = Field(
+        None, description="folders and URLs below which recordings may lie, divided by colons; default: anywhere"
+    )
     sql_time_limit_s: float = Field(60.0, gt=0, description="time limit of `semdb sql`")
+
+    @property
+    def roots(self) -> tuple[str, ...]:
+        """The entries of `recording_roots`; () where nothing is set."""
+        return () if self.recording_roots is None else split_roots(self.recording_roots)
+
+    @field_validator("recording_roots")
+    @classmethod
+    def _recording_roots(cls, text: str | None) -> str | None:
+        if text is not None:
+            split_roots(text)
+        return text
 
     @field_validator("broker_url")
     @classmethod

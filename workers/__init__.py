@@ -59,6 +59,7 @@ def make_app(settings: Settings) -> Any:
         },
         task_default_queue="semdb",
         worker_hijack_root_logger=False,
+        worker_consumer="semdb.workers.consumer:CarefulConsumer",
     )
     return application
 

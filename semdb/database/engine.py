@@ -15,7 +15,7 @@ from semdb.database import sqlite_file
 from semdb.database.blobs import BlobCursor
 from semdb.database.hosts import HOSTS, Failover, is_left, join_hosts, split_hosts
 from semdb.database.tls import TLS_KEYS, tls_arguments
-from semdb.errors import DatabaseError, UsageError
+from semdb.errors import UnstorableError, UsageError
 
 CONNECT_TIMEOUT_S = 5
 READ_TIMEOUT_S = 120  # more than the 50 s that a server lets a statement wait for a lock: that answer comes first
@@ -216,10 +216,10 @@ def _set_limit(connection: Any, seconds: int | None) -> None:
 
 
 def check_packet(connection: Connection, size: int, what: str) -> None:
-    """Raises DatabaseError when a statement with `size` bytes of values is more than the server takes."""
+    """Raises UnstorableError when a statement with `size` bytes of values is more than the server takes."""
     limit = connection.info.get("max_allowed_packet")
     if limit is not None and size > limit:
-        raise DatabaseError(
+        raise UnstorableError(
             f"{what} needs a statement of {size} bytes, and the server takes {limit}: "
             f"raise max_allowed_packet on the server (SET GLOBAL max_allowed_packet = {_next_power(size)})"
         )

@@ -15,8 +15,9 @@ from sqlalchemy import Connection, Engine, Table, insert, select
 from sqlalchemy.exc import IntegrityError
 
 from semdb.database import retry
-from semdb.database.tables import NAME_LENGTH, cameras, categories, models
-from semdb.errors import DatabaseError, UsageError
+from semdb.database.tables import cameras, categories, models
+from semdb.errors import DatabaseError, UnstorableError, UsageError
+from semdb.storable_names import NAME_LENGTH, name_problem
 from semdb.types import Camera, ModelInfo
 
 IN_CHUNK = 500
@@ -24,12 +25,24 @@ IN_CHUNK = 500
 
 def check_name(what: str, name: str) -> str:
     """`name`, if it can be stored and compared alike on all servers; UsageError if not."""
-    if not name or name != name.strip() or len(name) > NAME_LENGTH or not name.isprintable():
+    problem = name_problem(name)
+    if problem is not None:
         raise UsageError(
-            f"{name!r} cannot be the name of a {what}: 1 to {NAME_LENGTH} printable characters are needed, "
-            "no space at either end"
+            f"{_short(name)} cannot be the name of a {what}: it {problem}; 1 to {NAME_LENGTH} printable characters are "
+            "needed, no space at either end"
         )
     return name
+
+
+def _check_category(name: str) -> str:
+    problem = name_problem(name)
+    if problem is not None:
+        raise UnstorableError(f"the class {_short(name)} cannot be stored: its name {problem}")
+    return name
+
+
+def _short(name: str) -> str:
+    return repr(name if len(name) <= 60 else f"{name[:57]}...")
 
 
 def digest(values: Mapping[str, Any]) -> str:
@@ -78,7 +91,7 @@ class SharedIds:
         return {info: ids[row["digest"]] for info, row in wanted.items()}
 
     def categories(self, names: Iterable[str]) -> dict[str, int]:
-        wanted = sorted({check_name("category", name) for name in names})
+        wanted = sorted({_check_category(name) for name in names})
         return self._ensure(categories, "name", [{"name": name} for name in wanted])
 
     def camera(self, camera: Camera) -> int:

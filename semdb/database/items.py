@@ -36,6 +36,7 @@ from semdb.database import retry
 from semdb.database.clock import now_plus
 from semdb.database.records import ItemState, RecordingState
 from semdb.database.tables import ingest_items, recordings
+from semdb.shown import for_terminal
 
 LEASE_S = 60
 MOST_ATTEMPTS = 10  # claims without an outcome after which a keyframe is taken to kill its workers
@@ -184,9 +185,21 @@ def release_dead(engine: Engine, recording_id: int | None = None) -> int:
 
 def fail(engine: Engine, recording_id: int, claimed: Claim, error: str) -> bool:
     """Notes why a claimed keyframe cannot be described. False where the claim holds no longer: then nothing changes."""
-    values = {"state": ItemState.FAILED.value, "error": error[:4000], **_NOT_HELD}
+    values = {"state": ItemState.FAILED.value, "error": for_terminal(error)[:4000], **_NOT_HELD}
     change = update(ingest_items).where(held_by(recording_id, claimed.frame_index, claimed.token)).values(**values)
     return retry.write(engine, lambda c: c.execute(change).rowcount == 1)
+
+
+def give_up(engine: Engine, recording_id: int, frame_indexes: Sequence[int], error: str) -> int:
+    """Calls those keyframes failed that are planned and that no worker has in hand. Returns how many these are."""
+    expired = and_(_item.state == ItemState.RUNNING.value, _item.lease_until < now_plus())
+    free = and_(
+        _item.recording_id == recording_id,
+        _item.frame_index.in_(list(frame_indexes)),
+        or_(_item.state == ItemState.PENDING.value, expired),
+    )
+    values = {"state": ItemState.FAILED.value, "error": for_terminal(error)[:4000], **_NOT_HELD}
+    return retry.write(engine, lambda c: c.execute(update(ingest_items).where(free).values(**values)).rowcount)
 
 
 def left(engine: Engine, recording_id: int) -> tuple[int, int]:

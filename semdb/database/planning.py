@@ -21,6 +21,7 @@ from semdb.database.records import (
 )
 from semdb.database.tables import ingest_items, keyframes, map_models, maps, models, recordings
 from semdb.errors import DatabaseError, NotFoundError, ProvenanceError, UsageError
+from semdb.shown import for_terminal
 from semdb.types import ModelInfo
 
 ROLES = ("detector", "encoder", "features")
@@ -226,7 +227,7 @@ def fail_item(engine: Engine, recording_id: int, frame_index: int, error: str) -
         .values(
             state=ItemState.FAILED.value,
             attempts=ingest_items.c.attempts + 1,
-            error=error[:4000],
+            error=for_terminal(error)[:4000],
             worker=None,
             lease_until=None,
         )

@@ -12,18 +12,19 @@ from __future__ import annotations
 
 import random
 import sqlite3
+import struct
 import time
 from collections.abc import Callable
 from typing import TypeVar
 from weakref import WeakSet
 
 from sqlalchemy import Connection, Engine
-from sqlalchemy.exc import DBAPIError, IntegrityError, OperationalError, SQLAlchemyError
+from sqlalchemy.exc import DataError, DBAPIError, IntegrityError, OperationalError, SQLAlchemyError
 
 from semdb.database.engine import WRITE, safe_url
 from semdb.database.hosts import HOSTS, is_left
 from semdb.database.sqlite_file import FileConnection
-from semdb.errors import DatabaseError, DatabaseUnavailableError, RecordingUnavailableError
+from semdb.errors import DatabaseError, DatabaseUnavailableError, RecordingUnavailableError, UnstorableError
 
 T = TypeVar("T")
 _now = time.monotonic
@@ -39,6 +40,8 @@ MAY_HEAL = (DatabaseUnavailableError, RecordingUnavailableError)
 FIRST_TASK_DELAY_S = 2.0
 LONGEST_TASK_DELAY_S = 300.0
 _NO_ROOM = {3, 28, 1021, 1026, 1114}
+# Values that their column, a statement or the log of changes does not take: null, a row, packet, number, text or date.
+_UNFIT = {1048, 1118, 1153, 1264, 1265, 1292, 1366, 1367, 1406}
 # Nothing listens, no such host, access denied, no such schema: trying again does not help.
 _UNREACHABLE = {2002, 2003, 2005}
 _LOST = {2006, 2013, 4031}
@@ -77,6 +80,8 @@ def _run(engine: Engine, work: Callable[[Connection], T], *, write: bool) -> T:
             failure = error
         except SQLAlchemyError as error:
             raise explain(engine, error) from error
+        except (OverflowError, UnicodeError, struct.error) as error:  # of the driver, on writing down a value
+            raise UnstorableError(f"the database {safe_url(engine.url)} cannot hold a value: {error}") from error
         gone_since = (gone_since or _now()) if _may_be_starting(failure) else None
         patient = write and gone_since is not None and _now() - gone_since < RESTART_S
         if attempt >= ATTEMPTS and not patient:
@@ -167,7 +172,8 @@ def explain(
         advice = _of_server(code, attempts, setting, answered=engine in _answered)
     heals = is_busy(error) or code in _UNREACHABLE | _LOST | _NO_ROOM | RETRIED_CODES or name == "SQLITE_FULL"
     heals = heals or is_left(code, reason)
-    kind = DatabaseUnavailableError if heals else DatabaseError
+    unfit = isinstance(error, DataError) or code in _UNFIT or name in ("SQLITE_TOOBIG", "SQLITE_MISMATCH")
+    kind = DatabaseUnavailableError if heals else UnstorableError if unfit else DatabaseError
     return kind(f"the database {safe_url(engine.url)} {advice} ({reason})")
 
 

@@ -19,7 +19,7 @@ from semdb.database.ids import SharedIds, new_id
 from semdb.database.items import Claim, held_by
 from semdb.database.planning import check_models, map_model_ids
 from semdb.database.records import ChangeKind, ItemState, KeyframeRecord, RecordingState, WriteResult
-from semdb.errors import DatabaseError, LeaseLostError, NotFoundError, UsageError
+from semdb.errors import LeaseLostError, NotFoundError, UnstorableError, UsageError
 from semdb.geometry import quat_wxyz_from_rotation
 from semdb.types import Description, FloatArray, ModelInfo
 
@@ -79,8 +79,8 @@ class KeyframeWriter:
 
         With `claimed` only while that claim holds: LeaseLostError when it does not, and nothing is written.
         Raises ProvenanceError for other models than the map's, NotFoundError without such a recording, UsageError
-        for a frame that is not in its plan or a description that contradicts itself, DatabaseError for a value
-        that is too large for the server or when the database gives up.
+        for a frame that is not in its plan or a description that contradicts itself, UnstorableError for a value that
+        the database will never take, DatabaseError when it gives up.
         """
         _check_description(record.description)
         failure: IntegrityError | None = None
@@ -95,7 +95,7 @@ class KeyframeWriter:
                 # Another writer stored the same keyframe, or a row that was remembered has been deleted.
                 failure = error
                 self.forget()
-        raise DatabaseError(
+        raise UnstorableError(
             f"frame {record.frame_index} of the recording {recording_id} could not be stored ({failure})"
         ) from failure
 
@@ -184,6 +184,11 @@ def _check_description(description: Description) -> None:
         raise UsageError(f"a keypoint lies on object {index.max()} of {len(description.detections)}")
     if len(description.geometry) != len(description.detections):
         raise UsageError("a description has one geometry per detection")
+    for detection in description.detections:
+        if not np.isfinite([detection.score, *detection.box]).all():
+            raise UsageError(
+                f"score and box of an object are finite numbers; those of a {detection.category!r} are not"
+            )
     if description.cnn_vector.ndim != 1 or not np.isfinite(description.cnn_vector).all():
         raise UsageError("the CNN vector of a description is one finite row")
 
@@ -315,6 +320,6 @@ def _write_children(connection: Connection, keyframe_id: int, rows: _Rows) -> No
 
 
 def _check_size(connection: Connection, table: Table, row: dict[str, Any], frame_index: int, factor: int = 1) -> None:
-    """Raises DatabaseError where the server does not take a row of `factor` bytes for each of its blobs'."""
+    """Raises UnstorableError where the server does not take a row of `factor` bytes for each of its blobs'."""
     size = _STATEMENT_OVERHEAD + sum(factor * len(value) for value in row.values() if isinstance(value, bytes))
     check_packet(connection, size, f"the {table.name} row of frame {frame_index}")

@@ -16,7 +16,7 @@ from semdb.database.items import OpenItem, open_items
 from semdb.database.planning import StoredPlan, check_models, stored_plan
 from semdb.database.requeue import requeue_failed
 from semdb.database.store import Store, open_store
-from semdb.errors import NotFoundError, RecordingUnavailableError, UsageError
+from semdb.errors import ModelError, NotFoundError, RecordingError, RecordingUnavailableError, UsageError
 from semdb.ingestion.run import (
     IngestOptions,
     IngestSummary,
@@ -152,9 +152,12 @@ class Workplace:
     ) -> ChunkOutcome:
         """Works off those of `frames` that nobody else has; `note` is told of each that is done.
 
+        Where the recording is, the database says: `source`, which was sent, is not asked.
+
         Where none is open the recording need not be there. One that was deleted gives an outcome that says `gone`.
-        Raises RecordingUnavailableError for one that cannot be seen here now, UsageError for one that is another here
-        than where it was planned, ProvenanceError where this worker has other models, DatabaseError, ModelError.
+        Raises RecordingUnavailableError for one that cannot be seen here now, RecordingError for one that is another
+        here than where it was planned, or that cannot be read, UsageError for one that may not be read here,
+        ProvenanceError where this worker has other models, ModelError where it has none, DatabaseError.
         """
         outcome = ChunkOutcome()
         with open_store(self._settings.database_url) as store:
@@ -163,7 +166,7 @@ class Workplace:
                 items.release_dead(store.engine, recording_id)
                 found = open_items(store.engine, recording_id, frames)
                 if any(not item.held for item in found):
-                    self._work_off(store, plan, source, found, outcome, stop, note)
+                    self._work_off(store, plan, found, outcome, stop, note)
                     found = open_items(store.engine, recording_id, frames)
                 outcome.held = tuple(item.frame_index for item in found if item.held)
                 outcome.left = tuple(item.frame_index for item in found if not item.held)
@@ -174,18 +177,24 @@ class Workplace:
                 outcome.gone = True  # deleted: there is nothing to do any more
         return outcome
 
+    def give_up(self, recording_id: int, frames: Sequence[int], error: str) -> int:
+        """Calls those of `frames` failed that are still to be done and that nobody has. Returns how many these are."""
+        with open_store(self._settings.database_url) as store:
+            number = items.give_up(store.engine, recording_id, frames, error)
+            store.finish_recording(recording_id)
+        return number
+
     def _work_off(
         self,
         store: Store,
         plan: StoredPlan,
-        source: str,
         found: list[OpenItem],
         outcome: ChunkOutcome,
         stop: Callable[[], bool],
         note: Callable[[Item], None],
     ) -> None:
         """Until nothing of `found` is free: a claim whose commit was answered by nobody is only seen when it ended."""
-        recording = self._recording(plan, source)
+        recording = self._recording(plan)
         describers = self._describers_of(store, plan, recording)
         frames = [item.frame_index for item in found]
         progress = True
@@ -211,23 +220,26 @@ class Workplace:
                     return
             found = open_items(store.engine, plan.recording_id, frames)
 
-    def _recording(self, plan: StoredPlan, source: str) -> Recording:
-        key = (plan.recording_id, source, plan.fingerprint)
+    def _recording(self, plan: StoredPlan) -> Recording:
+        key = (plan.recording_id, plan.source, plan.fingerprint)
         if self._opened is not None and self._opened[0] == key and self._opened[1].path.exists():
             return self._opened[1]
         self._opened = None
-        found = parse_source(source)
+        found = parse_source(plan.source)
         folder = locate(found.address, self._settings)
         if not folder.exists():
             raise RecordingUnavailableError(
                 f"{folder}: no such folder or file on this machine; workers must see recordings under the path "
                 "or URL that was given to `semdb ingest --queue`"
             )
-        [recording] = open_recordings(folder, found.parsed_camera, found.options)
+        opened = open_recordings(folder, found.parsed_camera, found.options)
+        if len(opened) != 1:
+            raise RecordingError(f"{folder}: on this machine there are {len(opened)} recordings, and one was planned")
+        recording = opened[0]
         known = {entry.index: entry for entry in recording.entries}
         entries = [known[index] for index in plan.frame_indexes if index in known]
         if len(entries) == len(plan.frame_indexes) and fingerprint(recording, entries) != plan.fingerprint:
-            raise UsageError(
+            raise RecordingError(
                 f"{folder}: on this machine it is another recording than the one that was planned: its camera, or "
                 "times or poses of keyframes differ"
             )
@@ -236,10 +248,13 @@ class Workplace:
 
     def _describers_of(self, store: Store, plan: StoredPlan, recording: Recording) -> list[Describer]:
         models = store.map_models(plan.map_id)
-        specs: ModelSpecs = specs_for_ingest(self._settings, models, has_masks=recording.categories is not None)
         own = settings_of_map(self._settings, models)
-        key = (specs, own.model_dump_json(exclude={"database_url", "reader_url", "broker_url"}))
-        if key not in self._describers:
-            self._describers = {key: make_describers(specs, own)}  # of one map at a time: networks are large
+        try:
+            specs: ModelSpecs = specs_for_ingest(self._settings, models, has_masks=recording.categories is not None)
+            key = (specs, own.model_dump_json(exclude={"database_url", "reader_url", "broker_url"}))
+            if key not in self._describers:
+                self._describers = {key: make_describers(specs, own)}  # of one map at a time: networks are large
+        except UsageError as error:
+            raise ModelError(f"this worker has not the models: {error}") from error
         check_models(models, self._describers[key][0].models, "the map")  # before keyframes are claimed in vain
         return self._describers[key]

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from semdb.database import items
 from semdb.database.findings import write_findings
+from semdb.database.ids import check_name
 from semdb.database.planning import check_models
 from semdb.database.records import PlannedRecording, RecordingFinding, RecordingPlan
 from semdb.database.requeue import requeue_failed
@@ -199,7 +200,7 @@ def open_all(paths: Sequence[Path | str], settings: Settings, options: IngestOpt
         if len(recordings) > 1:
             raise UsageError(f"--name names one recording, but {len(recordings)} were found")
         recordings[0].name = options.name
-    _check_names(recordings)
+    _check_names(recordings, options)
     return recordings
 
 
@@ -365,9 +366,12 @@ def _plan(
     return store.plan_recording(store.ensure_map(map_name), plan, models)
 
 
-def _check_names(recordings: Sequence[Recording]) -> None:
+def _check_names(recordings: Sequence[Recording], options: IngestOptions) -> None:
+    """Before anything is computed. Raises UsageError."""
     seen: dict[str, Path] = {}
     for recording in recordings:
+        check_name("map", options.map_of(recording))
+        check_name("recording", recording.name)
         if recording.name in seen:
             raise UsageError(
                 f"{recording.path} and {seen[recording.name]} are both named {recording.name!r}: "

@@ -30,13 +30,15 @@ from semdb.errors import (
     LeaseLostError,
     ModelError,
     RecordingUnavailableError,
+    SemdbError,
+    UnstorableError,
     UsageError,
 )
 from semdb.events import event
 from semdb.ingestion.pipeline import Stage, overlapped
 from semdb.perception.describe import Describer, View
 from semdb.recordings.base import FrameEntry, Recording
-from semdb.types import Description, Frame
+from semdb.types import Description, Frame, InstanceMasks
 
 STAGES = ("read", "detect", "encode", "features", "store")
 
@@ -209,16 +211,27 @@ def _read(recording: Recording, item: Item) -> Item:
                 f"{recording.path}: the recording is not there any more; when it is mounted again, run the same again"
             ) from error
         item.error = str(error)
+    except (SemdbError, OSError, MemoryError):
+        raise
+    except Exception as error:
+        _note_unexpected(item, item.entry.name, error)
     item.seconds["read"] = time.perf_counter() - started
     return item
+
+
+def _note_unexpected(item: Item, name: str, error: Exception) -> None:
+    """An error that no code here knows, on what is in one frame: others can be stored all the same."""
+    item.error = f"{name}: {type(error).__name__}: {error}"
+    event("unexpected", exc_info=error, frame=item.claim.frame_index, error=item.error)
 
 
 def _describe(idle: SimpleQueue[Describer], group: list[Item]) -> list[Item]:
     """Those of `group` that could be read go through the networks at once; where that fails, one by one."""
     read = [(item, item.frame) for item in group if item.frame is not None]
-    for _, frame in read:
+    for item, frame in read:
         if frame.world_from_camera is None:
-            raise UsageError(f"{frame.name} has no pose, so it cannot be a keyframe")
+            item.frame, item.error = None, f"{frame.name} has no pose, so it cannot be a keyframe"
+    read = [(item, frame) for item, frame in read if item.frame is not None]
     describer = idle.get()
     try:
         if len(read) > 1 and _describe_at_once(describer, read):
@@ -235,8 +248,8 @@ def _describe_at_once(describer: Describer, read: Sequence[tuple[Item, Frame]]) 
     views = [View(frame.image, frame.depth, frame.camera, frame.instances) for _, frame in read]
     try:
         found = describer.describe_batch(views)
-    except (FrameError, ModelError) as error:
-        event("one_by_one", frames=len(views), error=str(error))
+    except Exception as error:
+        event("one_by_one", frames=len(views), error=f"{type(error).__name__}: {error}")
         return False
     for (item, _), description in zip(read, found, strict=True):
         _take(item, description)
@@ -244,7 +257,7 @@ def _describe_at_once(describer: Describer, read: Sequence[tuple[Item, Frame]]) 
 
 
 def _describe_alone(describer: Describer, item: Item, frame: Frame) -> None:
-    """Raises ModelError when it is the networks that fail, and not this frame that they fail on."""
+    """Raises what the networks raise when it is they that fail, and not this frame on which they do."""
     try:
         description = describer.describe(frame.image, frame.depth, frame.camera, frame.instances)
     except FrameError as error:
@@ -253,6 +266,12 @@ def _describe_alone(describer: Describer, item: Item, frame: Frame) -> None:
         if not _works(describer, frame):
             raise
         item.error = f"{frame.name}: {error}"
+    except (SemdbError, OSError, MemoryError):
+        raise
+    except Exception as error:
+        if not _works(describer, frame):
+            raise
+        _note_unexpected(item, frame.name, error)
     else:
         _take(item, description)
 
@@ -260,9 +279,11 @@ def _describe_alone(describer: Describer, item: Item, frame: Frame) -> None:
 def _works(describer: Describer, like: Frame) -> bool:
     """Whether `describer` can describe noise of the size of a frame."""
     noise = np.random.default_rng(0).integers(0, 256, like.image.shape, dtype=np.uint8)
+    masks = like.instances
+    nothing = None if masks is None else InstanceMasks(np.zeros_like(masks.labels), masks.categories)
     try:
-        describer.describe(noise, None, like.camera, like.instances)
-    except ModelError:
+        describer.describe(noise, None, like.camera, nothing)
+    except Exception:
         return False
     return True
 
@@ -296,6 +317,9 @@ def _store(store: Store, recording_id: int, item: Item, descriptor_dtype: str = 
         item.created = store.write_keyframe(recording_id, record, item.claim).created
     except LeaseLostError:
         item.lost = True
+    except (UnstorableError, UsageError) as error:
+        item.error = f"{frame.name}: {error}"
+        item.lost = not items.fail(store.engine, recording_id, item.claim, item.error)
     item.objects, item.keypoints = len(description.detections), len(description.keypoints)
     item.seconds["store"] = time.perf_counter() - started
     return item

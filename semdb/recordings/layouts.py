@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import fields
 from pathlib import Path
 
-from semdb.errors import RecordingError, UsageError
+from semdb.errors import RecordingError, RecordingUnavailableError, UsageError
 from semdb.recordings import (
     colmap_model,
     icl_nuim,
@@ -72,7 +72,7 @@ def not_a_recording(path: Path) -> RecordingError:
         return RecordingError(f"{path}: is a file that no reader knows; {known}")
     children = sorted(path.iterdir())
     if not children:
-        return RecordingError(f"{path}: the folder is empty; {known}")
+        return RecordingUnavailableError(f"{path}: the folder is empty; {known}")  # or nothing is mounted there
     inside = [child.name for child in children[:CHILDREN_LOOKED_AT] if _looks_like_recording(child)]
     if inside:
         return RecordingError(f"{path}: is no recording itself, but these in it are: {', '.join(inside[:10])}")

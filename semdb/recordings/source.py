@@ -19,6 +19,7 @@ from semdb.errors import RecordingError, RecordingUnavailableError, UsageError
 from semdb.recordings.cameras import parse_camera
 from semdb.recordings.credentials import refuse_credentials
 from semdb.recordings.options import AS_THE_FORMAT_SAYS, ReadOptions, read_options, write_options
+from semdb.recordings.roots import check_root
 from semdb.settings import Settings
 from semdb.types import Camera
 
@@ -80,10 +81,12 @@ def parse_source(source: str) -> Source:
 def locate(address: str, settings: Settings) -> Path:
     """The folder on this machine: `address` itself, or the copy of a URL, brought up to date.
 
-    Raises UsageError for a URL with a password, or where fsspec, or what it needs for this kind of URL, is not
-    installed, RecordingError for a URL with nothing under it, RecordingUnavailableError when it cannot be reached.
+    Raises UsageError for a URL with a password, for what is not below SEMDB_RECORDING_ROOTS, or where fsspec, or what
+    it needs for this kind of URL, is not installed, RecordingError for a URL with nothing under it,
+    RecordingUnavailableError when it cannot be reached.
     """
     refuse_credentials(address)
+    check_root(address, settings.roots)
     if not is_address(address):
         return Path(address)
     return fetch(address, settings.cache_dir.expanduser() / "recordings")

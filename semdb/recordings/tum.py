@@ -30,6 +30,7 @@ from semdb.recordings.base import DroppedFrame, FrameEntry, Layout, Recording
 from semdb.recordings.cameras import TUM_DEPTH_SCALE, tum_camera
 from semdb.recordings.options import ReadOptions
 from semdb.shown import measure
+from semdb.storable_names import name_problem
 from semdb.types import Camera
 
 _LABEL = re.compile(r"[0-9]{1,9}")
@@ -99,6 +100,8 @@ def read_categories(path: Path) -> dict[int, str] | None:
             raise RecordingError(f"{file}: key {key[:40]!r} must be a label from 1 to 65535 with a class name as text")
         if value != written(value):
             raise RecordingError(f"{file}: the class name of label {key} is no text: {value!r}")
+        if (problem := name_problem(value)) is not None:
+            raise RecordingError(f"{file}: the class name {value[:60]!r} of label {key} {problem}: change it there")
         categories[int(key)] = value
     return categories
 

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from semdb.errors import FrameError, TrainingError
 from semdb.files import MissingFileError, UnusableFileError, read_json
 from semdb.recordings.images import decode_color, orientation_of, read_bytes
+from semdb.storable_names import name_problem
 from semdb.types import BoolArray, ImageArray
 
 BACKGROUND = "background"
@@ -104,6 +105,9 @@ def _parse(content: dict[str, Any], file: Path, images: Path, wanted: Sequence[s
     unknown = [name for name in names if name not in by_name]
     if unknown:
         raise TrainingError(f"{file} has no class {', '.join(unknown)}; it has {', '.join(sorted(by_name))}")
+    for name in names:
+        if (problem := name_problem(name)) is not None:
+            raise TrainingError(f"{file}: the class name {name[:60]!r} {problem}: change it there, or leave it out")
     labels = {name: k for k, name in enumerate(names, start=1)}
     label_of = {int(category["id"]): labels.get(str(category["name"])) for category in content["categories"]}
     images_listed = _once(content["images"], file, notes)

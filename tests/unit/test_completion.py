@@ -214,6 +214,6 @@ def test_tab_on_a_terminal(name: str) -> None:
         terminal.type(f"{clear}semdb ingest --detector onnx:n\t", "net.onnx ")
         terminal.type(f"{clear}semdb status --map=ro\t", "--map=room ")
         terminal.type(f"{clear}semdb ingest with\t", r"with\ space/")
-        shown = terminal.type(f"{clear}semdb models \t\t", "export")
+        shown = terminal.type(f"{clear}semdb models \t\t", "pull")
         assert "list" in shown
         assert "pull" in shown

@@ -7,11 +7,15 @@ import logging
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from celery.exceptions import Reject, Retry, SoftTimeLimitExceeded
+from celery.exceptions import Ignore, Reject, Retry, SoftTimeLimitExceeded
+from hypothesis import given
+from hypothesis import settings as settings_of_hypothesis
+from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from semdb.cli.main import app as cli
@@ -40,6 +44,7 @@ from semdb.workers import (
     stopping,
     tasks,
 )
+from semdb.workers.messages import ItemsMessage, items_message, plan_message
 from semdb.workers.tasks import ingest_recording
 
 
@@ -80,16 +85,18 @@ def test_the_task_plans_and_sends_and_adds_nothing_when_it_comes_twice(
 
 
 class Sent:
-    """Stands for `retry` of a task: pauses with which messages were sent again."""
+    """Stands for `retry` of a task: pauses with which messages were sent again, and their last headers."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, name: str, retries: int = 0) -> None:
         self.task = app.tasks[name]
         self.pauses: list[float] = []
+        self.headers: dict[str, int] = {}
         monkeypatch.setattr(self.task, "retry", self)
         monkeypatch.setattr(self.task.request, "retries", retries)
 
-    def __call__(self, *, countdown: float, **_: Any) -> Retry:
+    def __call__(self, *, countdown: float, headers: dict[str, int], **_: Any) -> Retry:
         self.pauses.append(countdown)
+        self.headers = headers
         return Retry()
 
 
@@ -102,11 +109,22 @@ def pauses(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return made
 
 
+@pytest.fixture
+def given_up(caplog: pytest.LogCaptureFixture) -> Iterator[Callable[[], list[str]]]:
+    """The lines of messages that were given up, each as the log has it."""
+    with caplog.at_level(logging.ERROR, "semdb"):
+        yield lambda: [r.getMessage() for r in caplog.records if r.getMessage().startswith("given_up")]
+
+
 class Place:
     """A workplace of which `do` raises, or returns, what it is told."""
 
     def __init__(self, *outcomes: object) -> None:
         self.outcomes = list(outcomes)
+        self.given_up: list[tuple[Any, ...]] = []
+
+    def give_up(self, *what: Any) -> None:
+        self.given_up.append(what)
 
     def do(self, *_: Any, **__: Any) -> ChunkOutcome:
         outcome = self.outcomes.pop(0)
@@ -120,7 +138,6 @@ FAULTS = [
     ProvenanceError("other models"),
     ModelError("no such file"),
     SchemaError("older"),
-    UsageError("another recording"),
     DatabaseError("access denied"),
     OSError("no room"),
 ]
@@ -181,7 +198,8 @@ def test_what_is_left_is_sent_on_and_what_is_held_later(monkeypatch: pytest.Monk
         (DatabaseUnavailableError("down"), 50, (150, 300)),
         (SoftTimeLimitExceeded(), 1, (2, 4)),
         (BrokerError("gone"), 0, (1, 2)),
-        (UsageError("no detector"), 9, (150, 300)),
+        (UsageError("no detector"), 9, (1, 2)),
+        (ValueError("a bug"), 9, (1, 2)),
         (ProvenanceError("other models"), 50, (0, 0)),
     ],
 )
@@ -206,13 +224,213 @@ def test_a_recording_that_cannot_be_planned_now_is_tried_again(
     assert len(pauses) == isinstance(error, ProvenanceError)
 
 
-def test_a_recording_that_no_worker_can_plan_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    sent = Sent(monkeypatch, INGEST_TASK, retries=tasks.PLAN_TRIES)
-    with pytest.raises(RecordingError, match="the folder is empty"):
+def test_a_recording_that_no_worker_can_plan_is_given_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pauses: list[float], given_up: Callable[[], list[str]]
+) -> None:
+    sent = Sent(monkeypatch, INGEST_TASK)
+
+    def refuse(*_: Any, **__: Any) -> None:
+        raise UsageError("it is stored already and is another one")
+
+    monkeypatch.setattr(tasks, "queue_recordings", refuse)
+    for failures in range(again.MOST_FAILURES - 1):
+        with pytest.raises(Retry):
+            sent.task(str(tmp_path))
+        assert 2.0**failures <= sent.pauses[-1] <= 2.0 ** (failures + 1) or sent.pauses[-1] >= 150
+        assert sent.headers == {again.FAILURES: failures + 1, again.LOSSES: 0}
+        monkeypatch.setitem(sent.task.request.__dict__, again.FAILURES, failures + 1)
+    with pytest.raises(Ignore):
         sent.task(str(tmp_path))
-    with pytest.raises(Retry):  # a mount may come back
-        sent.task(str(tmp_path / "away"))
-    assert len(sent.pauses) == 1
+    [line] = given_up()
+    assert line.startswith(f"given_up path={tmp_path} task=semdb.ingest_recording error=UsageError: it is stored")
+    assert pauses == []  # no other message waits
+
+
+def test_a_recording_that_cannot_be_read_is_refused_once_and_a_lost_mount_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given_up: Callable[[], list[str]]
+) -> None:
+    monkeypatch.setenv("SEMDB_DATABASE_URL", f"sqlite:///{tmp_path / 'a.sqlite3'}")
+    sent = Sent(monkeypatch, INGEST_TASK)
+    room = tmp_path / "room"
+    write_synthetic_recording(room, SyntheticOptions(frames=2, width=64, height=48))
+    classes = json.loads((room / "masks" / "classes.json").read_text())
+    for name in ("chair ", "a\x1b[31mb", "\n", "x" * 256, "", "\ud800"):
+        (room / "masks" / "classes.json").write_text(json.dumps({**classes, "1": name}))
+        with pytest.raises(Ignore):
+            sent.task(str(room))
+        line = given_up()[-1]
+        assert "masks/classes.json: the class name" in line
+        assert line.isprintable()
+    (room / "masks" / "classes.json").write_text(json.dumps(classes))
+    (room / "rgb.txt").write_text("1.0 rgb/a\0.png\n")
+    with pytest.raises(Ignore):
+        sent.task(str(room))
+    assert "rgb.txt, line 1: has a NUL in the file name" in given_up()[-1]
+    assert len(given_up()) == 7
+    (tmp_path / "mount").mkdir()
+    for path in ("away", "mount"):  # not there; nothing mounted
+        with pytest.raises(Retry):
+            sent.task(str(tmp_path / path))
+    assert len(given_up()) == 7
+
+
+def test_no_message_is_tried_for_ever(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pauses: list[float], given_up: Callable[[], list[str]]
+) -> None:
+    sent = Sent(monkeypatch, ITEMS_TASK, retries=again.MOST_TRIES)
+    errors = (DatabaseUnavailableError("down"), ModelError("none"), SoftTimeLimitExceeded(), UsageError("no"))
+    place = Place(*errors)
+    monkeypatch.setattr(tasks, "_workplaces", [place])
+    for _ in errors:
+        with pytest.raises(Ignore):
+            sent.task(1, "room", [1, 2])
+    assert len(given_up()) == 4
+    assert place.given_up == [(1, (1, 2), "no")]  # what may heal, or is of the worker, stays in the plan
+    assert sent.pauses == pauses == []
+
+
+def test_keyframes_that_every_worker_fails_at_are_failed_and_hold_up_nothing(
+    monkeypatch: pytest.MonkeyPatch, pauses: list[float], given_up: Callable[[], list[str]]
+) -> None:
+    sent = Sent(monkeypatch, ITEMS_TASK)
+    monkeypatch.setitem(sent.task.request.__dict__, again.FAILURES, again.MOST_FAILURES - 2)
+    place = Place(RecordingError("is \x1b[31manother"), ValueError("embedded\nnull byte"))
+    monkeypatch.setattr(tasks, "_workplaces", [place])
+    with pytest.raises(Retry):
+        sent.task(1, "room", [1, 2])
+    monkeypatch.setitem(sent.task.request.__dict__, again.FAILURES, again.MOST_FAILURES - 1)
+    with pytest.raises(Ignore):
+        sent.task(1, "room", [1, 2])
+    assert place.given_up == [(1, (1, 2), "ValueError: embedded\nnull byte")]
+    assert [line.split("\n")[0] for line in given_up()] == [
+        r"given_up recording=1 frames=2 task=semdb.ingest_items error=ValueError: embedded\nnull byte"
+    ]
+    assert pauses == []
+
+
+def test_messages_over_which_workers_are_lost_are_counted_and_given_up(
+    monkeypatch: pytest.MonkeyPatch, given_up: Callable[[], list[str]]
+) -> None:
+    sent = Sent(monkeypatch, ITEMS_TASK)
+    place = Place()  # nothing is done of a message that came back: it is sent anew first
+    monkeypatch.setattr(tasks, "_workplaces", [place])
+    monkeypatch.setattr(sent.task.request, "delivery_info", {"redelivered": True})
+    for losses in range(1, again.MOST_LOSSES):
+        with pytest.raises(Retry):
+            sent.task(1, "room", [1])
+        assert sent.headers == {again.FAILURES: 0, again.LOSSES: losses}
+        monkeypatch.setitem(sent.task.request.__dict__, again.LOSSES, losses)
+    with pytest.raises(Ignore):
+        sent.task(1, "room", [1])
+    assert place.given_up == [(1, (1,), f"workers were lost {again.MOST_LOSSES} times over this message")]
+    assert len(given_up()) == 1
+
+
+def test_a_count_that_is_no_number_counts_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    sent = Sent(monkeypatch, ITEMS_TASK)
+    for value in ("many", -5, None, [1]):
+        monkeypatch.setitem(sent.task.request.__dict__, again.FAILURES, value)
+        assert again._header(sent.task, again.FAILURES) == 0
+
+
+POISON_ITEMS: list[tuple[list[Any], dict[str, Any]]] = [
+    ([], {}), ([1], {}), ([1, "x"], {}), ([1, "x", [1], 4], {}), ([1, "x", [1]], {"frames": [1]}),
+    ([1, "x", [1]], {"hurry": True}), (["1", "x", [1]], {}), ([1.5, "x", [1]], {}), ([True, "x", [1]], {}),
+    ([None, "x", [1]], {}), ([{}, "x", [1]], {}), ([[], "x", [1]], {}), ([-1, "x", [1]], {}), ([0, "x", [1]], {}),
+    ([2**63, "x", [1]], {}), ([10**5000, "x", [1]], {}), ([1, None, [1]], {}), ([1, 5, [1]], {}), ([1, "", [1]], {}),
+    ([1, "a\0b", [1]], {}), ([1, "x" * 5000, [1]], {}), ([1, "x", None], {}), ([1, "x", 5], {}), ([1, "x", "12"], {}),
+    ([1, "x", {"0": 1}], {}),
+    ([1, "x", ["1"]], {}), ([1, "x", [1.0]], {}), ([1, "x", [None]], {}), ([1, "x", [[1]]], {}),
+    ([1, "x", [True]], {}), ([1, "x", [-1]], {}), ([1, "x", [2**31]], {}), ([1, "x", [10**400]], {}),
+    ([1, "x", [float("nan")]], {}), ([1, "x", list(range(100_000))], {}),
+]  # fmt: skip
+POISON_PLANS: list[tuple[list[Any], dict[str, Any]]] = [
+    ([], {}), ([None], {}), ([5], {}), ([""], {}), (["a\0b"], {}), (["x" * 5000], {}), ([["x"]], {}), ([{}], {}),
+    (["x", "m", "n", {}, 5], {}), (["x"], {"path": "y"}), (["x"], {"speed": 1}), (["x", 5], {}), (["x", ""], {}),
+    (["x", "m "], {}), (["x", "m\n"], {}), (["x", "m" * 256], {}), (["x", "\udce9"], {}), (["x", None, 5], {}),
+    (["x", None, "n\x1b[31m"], {}), (["x", None, None, []], {}), (["x", None, None, "keyframes"], {}),
+    (["x"], {"options": {"speed": 3}}), (["x"], {"options": {"stride": "3"}}), (["x"], {"options": {"stride": True}}),
+    (["x"], {"options": {"keyframes": 0}}), (["x"], {"options": {"keyframes": -5}}),
+    (["x"], {"options": {"keyframes": 10**30}}), (["x"], {"options": {"keyframes": 2.5}}),
+    (["x"], {"options": {"camera": "1,2"}}), (["x"], {"options": {"camera": 5}}),
+    (["x"], {"options": {"camera": "nan,1,1,1"}}), (["x"], {"options": {"reading": "depth_scale=-1"}}),
+    (["x"], {"options": {"reading": "no=1"}}), (["s3://a:secret@b/room"], {}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("task", "given", "named"),
+    [(ITEMS_TASK, *poison) for poison in POISON_ITEMS] + [(INGEST_TASK, *poison) for poison in POISON_PLANS],
+)
+def test_messages_that_make_no_sense_are_refused_once_with_one_line(
+    monkeypatch: pytest.MonkeyPatch,
+    pauses: list[float],
+    caplog: pytest.LogCaptureFixture,
+    task: str,
+    given: list[Any],
+    named: dict[str, Any],
+) -> None:
+    sent = Sent(monkeypatch, task)
+    monkeypatch.setattr(tasks, "_workplaces", [Place()])  # nothing is done
+    monkeypatch.setattr(tasks, "queue_recordings", lambda *_, **__: pytest.fail("it was planned"))
+    with caplog.at_level(logging.DEBUG, "semdb"), pytest.raises(Ignore):
+        sent.task(*given, **named)
+    [record] = caplog.records
+    assert record.levelno == logging.ERROR
+    line = record.getMessage()
+    assert line.startswith(f"given_up task={task} error=")
+    assert line.isprintable()
+    assert len(line) < 400
+    assert "secret" not in line
+    assert sent.pauses == pauses == []
+
+
+@given(
+    st.sampled_from([ITEMS_TASK, INGEST_TASK]),
+    st.lists(st.recursive(st.none() | st.booleans() | st.floats() | st.integers() | st.text(), st.lists), max_size=5),
+    st.dictionaries(st.sampled_from(["path", "frames", "source", "x"]), st.text() | st.integers(), max_size=3),
+)
+@settings_of_hypothesis(deadline=None, max_examples=300)
+def test_any_message_is_understood_or_refused(task: str, given: list[Any], named: dict[str, Any]) -> None:
+    given = json.loads(json.dumps(given))
+    try:
+        found = items_message(given, named) if task == ITEMS_TASK else plan_message(given, named, ())
+    except UsageError:
+        return
+    if isinstance(found, ItemsMessage):
+        assert found.recording_id == given[0]
+        assert all(type(frame) is int for frame in found.frames)
+    else:
+        assert found.path == given[0] if given else named["path"]
+
+
+def test_paths_outside_the_roots_are_refused_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given_up: Callable[[], list[str]]
+) -> None:
+    (tmp_path / "in").mkdir()
+    (tmp_path / "out").mkdir()
+    (tmp_path / "in" / "link").symlink_to(tmp_path / "out")
+    monkeypatch.setenv("SEMDB_RECORDING_ROOTS", f"{tmp_path}/in:s3://bucket/rooms")
+    sent = Sent(monkeypatch, INGEST_TASK)
+    planned: list[str] = []
+    monkeypatch.setattr(tasks, "queue_recordings", lambda paths, *_, **__: planned.extend(paths) or [])
+    outside = [
+        f"{tmp_path}/out", "/", "/etc", f"{tmp_path}/in/../out", f"{tmp_path}/in/link", f"{tmp_path}/inside",
+        "relative",
+        f"file://{tmp_path}/out", f"file://{tmp_path}/in/%2e%2e/out", "s3://bucket/rooms/../secret", "s3://bucket/roomsX",
+        "s3://bucket/rooms/%2e%2e/x", "s3://other/rooms/1", "http://169.254.169.254/latest", "memory://x",
+        f"zip://a::file://{tmp_path}/in/a.zip", f"simplecache::file://{tmp_path}/in", f"local://{tmp_path}/out",
+        "file://host/data",
+    ]  # fmt: skip
+    for path in outside:
+        with pytest.raises(Ignore):
+            sent.task(path)
+    assert len(given_up()) == len(outside)
+    assert all("SEMDB_RECORDING_ROOTS" in line or "file" in line for line in given_up())
+    inside = [f"{tmp_path}/in", f"{tmp_path}/in/", "s3://bucket/rooms", "s3://bucket/rooms/1", f"file://{tmp_path}/in"]
+    for path in inside:
+        sent.task(path)
+    assert planned == inside
 
 
 def test_a_plan_is_not_begun_by_a_worker_that_is_to_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -285,13 +503,6 @@ def test_commands_end_with_2_at_a_broker_that_makes_no_sense(command: list[str])
 )
 def test_brokers_of_celery_are_taken_as_they_are(url: str) -> None:
     assert Settings(broker_url=url).broker_url == url
-
-
-def test_the_task_refuses_options_that_it_does_not_know() -> None:
-    with pytest.raises(UsageError, match="no option 'speed'"):
-        ingest_recording.apply(args=["nowhere"], kwargs={"options": {"speed": 3}}, throw=True)
-    with pytest.raises(UsageError, match="'stride' is '3', not of type int"):
-        ingest_recording.apply(args=["nowhere"], kwargs={"options": {"stride": "3"}}, throw=True)
 
 
 def test_without_the_extra_the_import_says_what_to_install() -> None:

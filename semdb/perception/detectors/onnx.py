@@ -12,6 +12,7 @@ from semdb.errors import ModelError
 from semdb.perception.detectors.coco import COCO_91, NO_OBJECT
 from semdb.perception.model_files import OnnxModel, canonical_json, resolve_onnx
 from semdb.settings import Settings
+from semdb.storable_names import check_class_names
 from semdb.types import BoolArray, Detection, Float32Array, ImageArray, InstanceMasks, ModelInfo
 
 MASK_THRESHOLD = 0.5
@@ -106,4 +107,5 @@ def _class_names(model: OnnxModel) -> tuple[str, ...]:
         names = None
     if not isinstance(names, list) or not names or not all(isinstance(name, str) and name for name in names):
         raise ModelError(f'{model.path}: metadata_props["classes"] must be a JSON list of names; it is {text[:60]!r}')
+    check_class_names(names, f'{model.path}: metadata_props["classes"]')
     return tuple(names)

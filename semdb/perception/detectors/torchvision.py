@@ -26,6 +26,7 @@ from semdb.perception.torch_models import (
     to_device,
 )
 from semdb.settings import Settings
+from semdb.storable_names import check_class_names
 from semdb.types import Detection, Float32Array, ImageArray, InstanceMasks, ModelInfo
 
 FORMAT = "semdb-detector"
@@ -131,6 +132,7 @@ def load_detector_checkpoint(
             classes = tuple(str(name) for name in content["classes"])
         except (KeyError, TypeError) as error:
             raise ModelError(f"{path} is a damaged checkpoint of semdb train ({first_line(error)})") from error
+        check_class_names(classes, str(path))
     elif known is None and file_sha256(path).startswith(BY_NAME["maskrcnn_resnet50_fpn"].sha256):
         known = _PUBLISHED["maskrcnn_resnet50_fpn"]
     network, architecture = mask_rcnn.load(state_dict_of(content, path), path, known)

@@ -7,6 +7,7 @@ of a track on each other, solve each keypoint's depth. All is a function of the 
 
 from __future__ import annotations
 
+import itertools
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -186,13 +187,13 @@ def _observations(
     one, two, a, b = one[keep], two[keep], a[keep], b[keep]
     order = np.lexsort((two, one, b, a))
     one, two, a, b = one[order], two[order], a[order], b[order]
-    heads = np.flatnonzero(np.r_[True, (a[1:] != a[:-1]) | (b[1:] != b[:-1])]) if len(a) else np.zeros(0, np.int64)
+    edges = np.flatnonzero(np.r_[True, (a[1:] != a[:-1]) | (b[1:] != b[:-1]), True]) if len(a) else np.zeros(0, int)
     moves: list[FloatArray] = []
     noise: list[float] = []
     which: list[IntArray] = []
     owner: list[Int64Array] = []
     seen: list[Int64Array] = []
-    for begin, end in zip(heads, np.r_[heads[1:], len(a)], strict=True):
+    for begin, end in itertools.pairwise(edges):  # of what two keyframes see both
         own, other = one[begin:end], two[begin:end]
         first, second = nodes.frames[a[begin]], nodes.frames[b[begin]]
         found = register(
