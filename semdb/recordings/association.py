@@ -89,8 +89,6 @@ def read_file_list(path: Path) -> tuple[list[TimedFile], list[BadLine]]:
         try:
             if found is None:
                 raise ValueError("needs a time and a file name")
-            if "\0" in found[2]:
-                raise ValueError("has a NUL in the file name")
             time = found[1].replace(",", ".") if "." not in found[1] else found[1]
             files.append(TimedFile(parse_time_ns(time), existing_name(path.parent, found[2]), number))
         except ValueError as error:
