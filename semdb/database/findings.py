@@ -8,7 +8,8 @@ from sqlalchemy import Connection, Engine, delete, insert, select
 
 from semdb.database import retry
 from semdb.database.records import RecordingFinding
-from semdb.database.tables import NAME_LENGTH, recording_findings
+from semdb.database.tables import recording_findings
+from semdb.storable_names import NAME_LENGTH
 
 
 def write_findings(engine: Engine, recording_id: int, findings: Sequence[RecordingFinding]) -> None:
