@@ -22,6 +22,8 @@ Int64Array = npt.NDArray[np.int64]
 ImageArray = npt.NDArray[np.uint8]
 BoolArray = npt.NDArray[np.bool_]
 
+FROM_MEMORY = "frames"  # format of recordings whose frames a program gave: nobody else can read them again
+
 
 @dataclass(frozen=True, slots=True)
 class Camera:

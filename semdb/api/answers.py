@@ -114,7 +114,7 @@ class StoredContent:
             for thing, mask in zip(stored.objects, store.load_masks(keyframe_id), strict=True)
         )
 
-    def keypoints(self, keyframe_id: int) -> Keypoints:
-        """Keypoints without descriptors. Raises NotFoundError, CodecError."""
+    def keypoints(self, keyframe_id: int) -> tuple[Keypoints, tuple[str, ...]]:
+        """Keypoints without descriptors, and the classes of the objects. Raises NotFoundError, CodecError."""
         [stored] = self._store().load_keyframes([keyframe_id], descriptors=False)
-        return stored.keypoints
+        return stored.keypoints, tuple(thing.category for thing in stored.objects)

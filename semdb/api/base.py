@@ -7,7 +7,9 @@ from collections.abc import Callable
 
 from semdb.api.here import Here, forget_after_fork
 from semdb.database.engine import parse_url, safe_url
+from semdb.database.records import MapHead
 from semdb.database.store import Store
+from semdb.errors import NotFoundError
 from semdb.settings import Settings
 
 Say = Callable[[str], None]
@@ -40,4 +42,12 @@ class Base:
         return self._here.store(create=create)
 
     def _map_id(self, name: str | None) -> int | None:
-        return None if name is None else self._store().find_map(name).id
+        """Of a map that is there. Raises NotFoundError, which names the maps there are."""
+        return None if name is None else self._head(name).id
+
+    def _head(self, name: str) -> MapHead:
+        for head in self._store().map_heads():
+            if head.name == name:
+                return head
+        self._store().find_map(name)
+        raise NotFoundError(f"the map {name!r} was deleted a moment ago")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -33,9 +34,13 @@ class Reading(Base):
         """All maps with how many recordings and keyframes they have, by id."""
         return self._store().maps()
 
+    def map(self, name: str) -> MapInfo:
+        """The map of that name. Raises NotFoundError, which names the maps there are."""
+        return self._store().find_map(name)
+
     def models(self, map: str) -> tuple[ModelInfo, ...]:
         """The detector, encoder and features that describe a map; empty for an empty one. Raises NotFoundError."""
-        return self._store().map_models(self._store().find_map(map).id)
+        return self._head(map).models
 
     def recordings(self, map: str | None = None) -> list[RecordingStatus]:
         """The recordings of a map, or of all, with what is planned and stored. Raises NotFoundError."""
@@ -58,17 +63,27 @@ class Reading(Base):
         return keyframe_of(self._store().keyframe_heads_of([keyframe_id])[0], StoredContent(self._store))
 
     def keyframes(
-        self, map: str, recording: str | None = None, *, after: int = 0, limit: int | None = None
+        self,
+        map: str | None = None,
+        recording: str | None = None,
+        *,
+        ids: Iterable[int] | None = None,
+        after: int = 0,
+        limit: int | None = None,
     ) -> list[Keyframe]:
         """The keyframes of a map, or of a recording of it, by id; at most `limit` of those after the id `after`.
 
-        Raises NotFoundError.
+        Or those with certain `ids`, by id. Raises NotFoundError, UsageError for neither or both.
         """
-        store = self._store()
-        map_id = store.find_map(map).id
+        store, content = self._store(), StoredContent(self._store)
+        if (map is None) == (ids is None):
+            raise UsageError("keyframes are those of a map= or those with certain ids=: say which")
+        if ids is not None:
+            return [keyframe_of(head, content) for head in store.keyframe_heads_of(sorted({int(key) for key in ids}))]
+        map_id = self._head(str(map)).id
         recording_id = None if recording is None else store.find_recording(map_id, recording)
         heads = store.keyframe_heads(map_id, recording_id, after=after, limit=limit)
-        return [keyframe_of(head, StoredContent(self._store)) for head in heads]
+        return [keyframe_of(head, content) for head in heads]
 
     def sql(self, statement: str) -> Rows:
         """The rows of one read-only statement, fetched while they are iterated over.

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from semdb.api.reading import Reading
@@ -11,12 +13,22 @@ from semdb.errors import UsageError
 
 if TYPE_CHECKING:  # the rooms behind are entered when something is asked of them: they take a second to import
     from semdb.door.protocol import Source
+    from semdb.evaluation.runner import EvaluateOptions, Outcome
     from semdb.ingestion.queue import Send
     from semdb.ingestion.run import IngestOptions, IngestSummary, Progress
     from semdb.localization.query_image import PathText
     from semdb.recordings.arrays import CameraLike
     from semdb.recordings.options import ReadOptions
     from semdb.refinement.run import StepResult
+
+
+@dataclass(frozen=True, slots=True)
+class SchemaChange:
+    """Revisions of the schema before (None: there was none) and now, and a server's collation where it was changed."""
+
+    before: str | None
+    now: str
+    collation: str | None
 
 
 class Writing(Reading):
@@ -150,7 +162,7 @@ class Writing(Reading):
             if map is not None or recording is not None:
                 raise UsageError("delete either keyframes or a recording or a map")
             wanted = sorted({int(key) for key in keyframes})
-            store.keyframe_heads_of(wanted)  # says which one does not exist
+            self.keyframes(ids=wanted)  # says which one does not exist
             return Deleted(0, store.delete_keyframes(wanted, progress))
         if recording is not None:
             return store.delete_recording(self.recording(recording, map).recording_id, progress)
@@ -158,18 +170,28 @@ class Writing(Reading):
             return store.delete_map(store.find_map(map).id, progress)
         raise UsageError("say what to delete: map=, recording= or keyframes=")
 
-    def init(self) -> tuple[str | None, str]:
-        """Creates or upgrades the schema. Returns its revision before (None: there was none) and now."""
+    def evaluate(
+        self, paths: Sequence[Path], options: EvaluateOptions | None = None, *, progress: Progress | None = None
+    ) -> Iterator[Outcome]:
+        """How well images are localized in keyframes of recordings: see `semdb.evaluation.runner.evaluate_each`.
+
+        Works on a database of its own beside this one, which stays as it is.
+        """
+        from semdb.evaluation.runner import evaluate_each
+
+        return evaluate_each(paths, self.settings, options, progress=progress, say=self._say)
+
+    def init(self) -> SchemaChange:
+        """Creates or upgrades the schema; nothing happens when it is there. Raises SchemaError, DatabaseError."""
         from semdb.database import schema
         from semdb.database.engine import make_engine
 
         engine = make_engine(self.settings.database_url)
         try:
             before = schema.current_revision(engine)
-            schema.upgrade(engine)
+            return SchemaChange(before, schema.HEAD, schema.upgrade(engine))
         finally:
             engine.dispose()
-        return before, schema.HEAD
 
     def _check_ingest(self, options: IngestOptions, has_masks: bool) -> None:
         """Loads the networks: one that is missing should not be noticed after an hour of frames."""

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from semdb.cli.options import Overrides, settings_options
+from semdb.cli.options import Overrides, open_database, settings_options
 from semdb.cli.output import print_lines
 from semdb.shown import for_terminal
-
-if TYPE_CHECKING:
-    from semdb.database.records import RecordingStatus
-    from semdb.database.store import Store
 
 command = typer.Typer(
     help="Delete recordings, maps or keyframes.",
@@ -39,21 +35,6 @@ def confirm(question: str, yes: bool) -> None:
         raise typer.Exit(1)
 
 
-def find_recording(store: Store, name: str, map_name: str | None) -> RecordingStatus:
-    """The recording of that name. Raises `NotFoundError`, or `UsageError` when several maps have one."""
-    from semdb.errors import NotFoundError, UsageError
-
-    everything = store.status(None if map_name is None else store.find_map(map_name).id)
-    found = [recording for recording in everything if recording.name == name]
-    if not found:
-        names = ", ".join(sorted({recording.name for recording in everything})) or "none"
-        raise NotFoundError(f"there is no recording {name!r} in {store.url}; recordings: {names}")
-    if len(found) > 1:
-        maps = ", ".join(recording.map for recording in found)
-        raise UsageError(f"the maps {maps} each have a recording {name!r}: say which with --map")
-    return found[0]
-
-
 @command.command("recording")
 @settings_options(models=False)
 def delete_recording(
@@ -66,13 +47,12 @@ def delete_recording(
 ) -> None:
     """Delete a recording: keyframes, images, objects, keypoints, vectors and its plan."""
     from semdb.cli.progress import Progress
-    from semdb.database.store import open_store
 
-    with open_store(overrides.settings().database_url) as store:
-        found = find_recording(store, name, map_name)
+    with open_database(overrides.settings()) as database:
+        found = database.recording(name, map_name)
         confirm(f"Delete the recording {found.map}/{found.name} with {found.keyframes} keyframes?", yes)
         with Progress(f"deleting {found.name}", "keyframes") as progress:
-            deleted = store.delete_recording(found.recording_id, progress.update)
+            deleted = database.delete(recording=found.name, map=found.map, progress=progress.update)
         print_lines(f"deleted the recording {found.map}/{found.name}: {deleted.keyframes} keyframes")
 
 
@@ -83,13 +63,12 @@ def delete_map(
 ) -> None:
     """Delete a map with all its recordings and its log of queries."""
     from semdb.cli.progress import Progress
-    from semdb.database.store import open_store
 
-    with open_store(overrides.settings().database_url) as store:
-        found = store.find_map(name)
+    with open_database(overrides.settings()) as database:
+        found = database.map(name)
         confirm(f"Delete the map {name} with {found.recordings} recordings, {found.keyframes} keyframes?", yes)
         with Progress(f"deleting {name}", "keyframes") as progress:
-            deleted = store.delete_map(found.id, progress.update)
+            deleted = database.delete(map=found.name, progress=progress.update)
         print_lines(f"deleted the map {name}: {deleted.recordings} recordings, {deleted.keyframes} keyframes")
 
 
@@ -102,12 +81,11 @@ def delete_keyframes(
 ) -> None:
     """Delete single keyframes; ingesting their recording again does not bring them back."""
     from semdb.cli.progress import Progress
-    from semdb.database.store import open_store
 
-    with open_store(overrides.settings().database_url) as store:
+    with open_database(overrides.settings()) as database:
         wanted = sorted(set(keyframes))
-        store.load_keyframes(wanted, descriptors=False)  # says which one does not exist
+        database.keyframes(ids=wanted)  # says which one does not exist
         confirm(f"Delete {len(wanted)} keyframes?", yes)
         with Progress("deleting", "keyframes") as progress:
-            number = store.delete_keyframes(wanted, progress.update)
-        print_lines(f"deleted {number} keyframes")
+            deleted = database.delete(keyframes=wanted, progress=progress.update)
+        print_lines(f"deleted {deleted.keyframes} keyframes")

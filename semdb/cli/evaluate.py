@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from semdb.cli.options import CameraOption, Overrides, Reading, reading_options, settings_options
+from semdb.cli.options import CameraOption, Overrides, Reading, open_database, reading_options, settings_options
 from semdb.shown import number
 
 if TYPE_CHECKING:
@@ -83,9 +83,9 @@ def command(
     ] = None,
 ) -> None:
     """Keyframes into a database of its own, other frames as queries, errors against the true poses."""
-    from semdb.cli.progress import StagedProgress, say
+    from semdb.cli.progress import StagedProgress
     from semdb.evaluation.methods import ABLATION
-    from semdb.evaluation.runner import EvaluateOptions, evaluate_each
+    from semdb.evaluation.runner import EvaluateOptions
     from semdb.evaluation.worst import WORST
     from semdb.recordings import parse_camera
 
@@ -108,7 +108,7 @@ def command(
     check_outputs(json_file, report, trajectories)
     output = Outputs(json_file, report, trajectories, used_settings(settings, options), expects_several(paths, options))
     with StagedProgress() as progress:
-        for outcome in evaluate_each(paths or [], settings, options, progress=progress.update, say=say):
+        for outcome in open_database(settings).evaluate(paths or [], options, progress=progress.update):
             output.add(outcome)
     output.finish(ablation)
 

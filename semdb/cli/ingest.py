@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
 from semdb.cli.ending import ends_when_told
-from semdb.cli.options import CameraOption, JsonFlag, Overrides, Reading, reading_options, settings_options
+from semdb.cli.options import (
+    CameraOption,
+    JsonFlag,
+    Overrides,
+    Reading,
+    open_database,
+    reading_options,
+    settings_options,
+)
 from semdb.shown import measure
 
 if TYPE_CHECKING:
@@ -56,11 +65,9 @@ def command(
 ) -> None:
     """Select keyframes, describe them and store them. Running it again adds nothing; cut off, it goes on."""
     from semdb.cli.output import print_json, print_lines
-    from semdb.cli.progress import StagedProgress, say
+    from semdb.cli.progress import StagedProgress
     from semdb.errors import UsageError
     from semdb.events import log_to
-    from semdb.ingestion.queue import queue_recordings
-    from semdb.ingestion.run import IngestOptions, ingest_recordings
     from semdb.recordings.options import option_of
 
     settings = overrides.settings(batch=batch)
@@ -85,12 +92,18 @@ def command(
         return
     if not paths:
         raise UsageError("name the folder of a recording: semdb ingest PATH (or --resume for what workers have left)")
-    options = IngestOptions(map_name, name, keyframes, stride, camera, reading, check=not no_check)
-    with StagedProgress() as progress, ends_when_told():
-        if queue:
-            summaries = queue_recordings(paths, settings, options, _send(), progress=progress.update, say=say)
-        else:
-            summaries = ingest_recordings(paths, settings, options, progress=progress.update, say=say)
+    with StagedProgress() as progress, ends_when_told(), open_database(settings) as database:
+        work = partial(database.queue, paths, _send()) if queue else partial(database.ingest, paths)
+        summaries = work(
+            map=map_name,
+            name=name,
+            keyframes=keyframes,
+            stride=stride,
+            camera=camera,
+            reading=reading,
+            check=not no_check,
+            progress=progress.update,
+        )
     if queue and not json:
         print_lines(*(queued_text(summary) for summary in summaries))
     elif json:
@@ -115,11 +128,10 @@ def _send() -> Send:
 
 def _resume(settings: Settings, *, json: bool) -> None:
     from semdb.cli.output import print_json, print_lines
-    from semdb.database.store import open_store
-    from semdb.ingestion.queue import sweep
 
-    with open_store(settings.database_url) as store:
-        sent = sweep(store, _send(), all_pending=True)
+    with open_database(settings) as database:
+        database.connect()
+        sent = database.resume(_send())
     if json:
         print_json({"sent": sent})
     else:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from semdb.cli.options import Overrides, settings_options
+from semdb.cli.options import Overrides, open_database, settings_options
 from semdb.cli.output import print_lines
+
+if TYPE_CHECKING:
+    from semdb.settings import Settings
 
 
 @settings_options(models=False)
@@ -27,13 +30,13 @@ def command(
     """Create or upgrade the schema; nothing happens when it is there."""
     from semdb.errors import UsageError
 
-    url = overrides.settings().database_url
+    settings = overrides.settings()
     if execute and not (accounts or reader):
         raise UsageError("--execute goes with --accounts or --reader")
     if accounts or reader:
-        _accounts(url, execute, only_reader=not accounts)
+        _accounts(settings.database_url, execute, only_reader=not accounts)
     else:
-        _init(url)
+        _init(settings)
 
 
 def _accounts(url: str, execute: bool, *, only_reader: bool) -> None:
@@ -62,23 +65,18 @@ def _accounts(url: str, execute: bool, *, only_reader: bool) -> None:
         print_lines(f"{'' if execute else '-- '}{role} ({variables[role]}): {account_url}")
 
 
-def _init(url: str) -> None:
-    from semdb.database import schema
-    from semdb.database.engine import make_engine, safe_url
+def _init(settings: Settings) -> None:
     from semdb.database.inspection import COLLATION
 
-    engine = make_engine(url)
-    try:
-        before = schema.current_revision(engine)
-        collation = schema.upgrade(engine)
-        where = safe_url(engine.url)
-    finally:
-        engine.dispose()
-    if collation is not None:
-        print_lines(f"changed the collation of the schema from {collation} to {COLLATION}, which keeps all names apart")
-    if before is None:
-        print_lines(f"created the schema, revision {schema.HEAD}, in {where}")
-    elif before != schema.HEAD:
-        print_lines(f"upgraded the schema of {where} from revision {before} to {schema.HEAD}")
+    with open_database(settings) as database:
+        made = database.init()
+    if made.collation is not None:
+        print_lines(
+            f"changed the collation of the schema from {made.collation} to {COLLATION}, which keeps all names apart"
+        )
+    if made.before is None:
+        print_lines(f"created the schema, revision {made.now}, in {database.url}")
+    elif made.before != made.now:
+        print_lines(f"upgraded the schema of {database.url} from revision {made.before} to {made.now}")
     else:
-        print_lines(f"the schema of {where} is up to date (revision {schema.HEAD})")
+        print_lines(f"the schema of {database.url} is up to date (revision {made.now})")

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from semdb.cli.options import Overrides, settings_options
+from semdb.cli.options import Overrides, open_database, settings_options
 
 if TYPE_CHECKING:
-    from semdb.database.records import StoredKeyframe
+    from semdb.api import Keyframe
 
 COLUMNS = ("object", "category", "x", "y", "size", "angle", "response", "laplacian", "X", "Y", "Z")
 
@@ -27,17 +27,15 @@ def command(
     object; a keypoint without depth has no 3D point.
     """
     from semdb.cli.output import print_rows
-    from semdb.cli.progress import say
-    from semdb.database.store import open_store
 
-    with open_store(overrides.settings().database_url, say=say) as store:
-        (loaded,) = store.load_keyframes([keyframe], descriptors=False)
-    print_rows(COLUMNS, rows(loaded), "csv" if csv else "table")
+    with open_database(overrides.settings()) as database:
+        listed = rows(database.keyframe(keyframe))
+    print_rows(COLUMNS, listed, "csv" if csv else "table")
 
 
-def rows(keyframe: StoredKeyframe) -> list[tuple[Any, ...]]:
+def rows(keyframe: Keyframe) -> list[tuple[Any, ...]]:
     """One row per keypoint, in stored order; None where there is no object or no 3D point."""
-    categories = {stored.ordinal: stored.category for stored in keyframe.objects}
+    categories = dict(enumerate(keyframe.categories))
     features, points = keyframe.keypoints.features, keyframe.keypoints.points
     result = []
     for i, ordinal in enumerate(keyframe.keypoints.object_index.tolist()):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from semdb.cli.options import CameraOption, JsonFlag, Overrides, settings_options
+from semdb.cli.options import CameraOption, JsonFlag, Overrides, open_database, settings_options
 from semdb.shown import measure
 
 if TYPE_CHECKING:
@@ -41,7 +41,6 @@ def command(
 
     An image that cannot be read is named on stderr and makes the exit code 1; the others are localized all the same.
     """
-    from semdb.api import Database
     from semdb.cli.output import print_json, print_lines
     from semdb.cli.progress import say
 
@@ -56,7 +55,7 @@ def command(
         broken.append(error)
         say(str(error))
 
-    with Database(settings, say=say) as database:
+    with open_database(settings) as database:
         for answer in database.localize_each(
             images, map=map_name, depth=depth, camera=camera, like=like, coarse=coarse, unreadable=unreadable
         ):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from semdb.cli.options import JsonFlag, Overrides, settings_options
+from semdb.cli.options import JsonFlag, Overrides, open_database, settings_options
 from semdb.cli.output import print_json, print_lines, print_table
 from semdb.errors import ModelError, UsageError
 
@@ -51,7 +51,7 @@ def list_models(overrides: Overrides, json: JsonFlag = False) -> None:
     """List the specs that settings can name, the model files at hand, and which models made the rows of each map."""
     settings = overrides.settings()
     chosen = {role: str(getattr(settings, role)) for role in ("detector", "encoder", "features")}
-    used = used_models(settings.database_url)
+    used = used_models(settings)
     files = model_files(settings, used or [])
     if json:
         specs = [{"role": r, "spec": s, "needs_file": f, "description": d} for r, s, f, d in SPECS]
@@ -235,18 +235,16 @@ def _licence_in(path: Path) -> str:
     return "not known"
 
 
-def used_models(url: str) -> list[dict[str, Any]] | None:
+def used_models(settings: Settings) -> list[dict[str, Any]] | None:
     """The models of each map, None where there is no database file yet. Raises `DatabaseError`."""
-    from semdb.cli.progress import say
     from semdb.database.engine import parse_url, sqlite_path
-    from semdb.database.store import open_store
 
-    path = sqlite_path(parse_url(url))
+    path = sqlite_path(parse_url(settings.database_url))
     if path is not None and not path.exists():
         return None
-    with open_store(url, say=say) as store:
+    with open_database(settings) as database:
         return [
             {"map": known.name, "role": m.role, "name": m.name, "sha256": m.sha256, "config": m.config}
-            for known in store.maps()
-            for m in store.map_models(known.id)
+            for known in database.maps()
+            for m in database.models(known.name)
         ]

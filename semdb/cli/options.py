@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, cast
 import typer
 
 if TYPE_CHECKING:
+    from semdb.api import Database
     from semdb.recordings.options import ReadOptions
     from semdb.settings import Settings
 
@@ -113,6 +114,14 @@ class Overrides:
 
             hide_password(self.database_url)
         return load_settings(**{name: value for name, value in given.items() if value is not None})
+
+
+def open_database(settings: Settings) -> Database:
+    """The database that a command goes through; what is assumed is said on stderr."""
+    from semdb.api import Database
+    from semdb.cli.progress import say
+
+    return Database(settings, say=say)
 
 
 def load_settings(**given: object) -> Settings:

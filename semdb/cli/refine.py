@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from semdb.cli.options import JsonFlag, Overrides, settings_options
+from semdb.cli.options import JsonFlag, Overrides, open_database, settings_options
 
 
 @settings_options(models=False)
@@ -25,25 +25,24 @@ def command(
     """
     from semdb.cli.output import print_json, print_lines
     from semdb.cli.progress import StagedProgress, say
-    from semdb.database.store import open_store
-    from semdb.refinement.run import refine_map, steps_of
+    from semdb.refinement.run import steps_of
 
     steps_of(step or ())
     done: list[dict[str, Any]] = []
-    with open_store(overrides.settings().database_url) as store:
-        infos = [store.find_map(map_name)] if map_name is not None else [i for i in store.maps() if i.keyframes]
-        for info in infos:
+    with open_database(overrides.settings()) as database:
+        names = [map_name] if map_name is not None else [info.name for info in database.maps() if info.keyframes]
+        for name in names:
             with StagedProgress() as progress:
-                results = refine_map(store, info, kinds=step or (), force=force, progress=progress.update)
+                results = database.refine(name, steps=step or (), force=force, progress=progress.update)
             for result in results:
                 state = "computed" if result.computed else "up to date"
                 if not json:
-                    print_lines(f"{info.name}: {result.summary}: {result.rows} rows, {state}")
+                    print_lines(f"{name}: {result.summary}: {result.rows} rows, {state}")
                 if not result.current:
-                    say(f"{info.name}: the map changed meanwhile, so {result.summary} is out of date: run it again")
+                    say(f"{name}: the map changed meanwhile, so {result.summary} is out of date: run it again")
                 done.append(
                     {
-                        "map": info.name,
+                        "map": name,
                         "step": result.kind,
                         "rows": result.rows,
                         "computed": result.computed,
@@ -52,5 +51,5 @@ def command(
                 )
     if json:
         print_json(done)
-    elif not infos:
+    elif not names:
         say("there is no keyframe to refine: ingest a recording first")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from semdb.cli.options import Overrides, settings_options
+from semdb.cli.options import Overrides, open_database, settings_options
 
 if TYPE_CHECKING:
     from semdb.settings import Settings
@@ -58,14 +58,10 @@ def command(
 
 def run(settings: Settings, statement: str, fmt: Format) -> None:
     """Runs one statement and prints its rows."""
-    from contextlib import closing
-
     from semdb.cli.output import print_rows
-    from semdb.database.readonly import run_readonly
 
-    columns, rows = run_readonly(settings, statement)
-    with closing(rows):
-        print_rows(columns, rows, fmt)
+    with open_database(settings) as database, database.sql(statement) as rows:
+        print_rows(rows.columns, rows, fmt)
 
 
 def run_text(settings: Settings, text: str, where: str, fmt: Format) -> None:

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping
 from itertools import islice
 from pathlib import Path
 
+from semdb.cli.options import open_database
 from semdb.cli.output import print_lines, print_rows
 from semdb.cli.sql_text import Statement, say_renamed, statements
 from semdb.errors import SemdbError, UsageError
@@ -92,15 +93,11 @@ class Prompt:
                 self._query(statement.text)
 
     def _query(self, statement: str) -> None:
-        from contextlib import closing
-
-        from semdb.database.readonly import run_readonly
-
         began = time.monotonic()
-        columns, rows = run_readonly(self.settings, statement)
-        with closing(rows):
+        with open_database(self.settings) as database, database.sql(statement) as rows:
+            columns = rows.columns
             shown = list(islice(rows, MOST_ROWS))
-            more = next(rows, None) is not None
+            more = next(iter(rows), None) is not None
         seconds = time.monotonic() - began
         say_renamed(columns, self.fmt)
         print_rows(columns, shown, self.fmt)

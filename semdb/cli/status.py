@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from semdb.cli.options import JsonFlag, Overrides, settings_options
+from semdb.cli.options import JsonFlag, Overrides, open_database, settings_options
 from semdb.cli.output import print_json, print_lines, print_table
 from semdb.shown import for_shell, measure
 
 if TYPE_CHECKING:
-    from semdb.database.records import FailedItem, RecordingStatus
-    from semdb.database.store import Store
-    from semdb.settings import Settings
+    from semdb.api import Database, Status
+    from semdb.database.records import FailedItem, RecordingStatus, Refinement
 
 SECONDS_BETWEEN_LOOKS = 2.0
 ERRORS_SHOWN = 10
@@ -34,24 +34,22 @@ def command(
     json: JsonFlag = False,
 ) -> None:
     """Show what is planned, stored and failed of each recording."""
-    from semdb.cli.progress import say
-    from semdb.database.store import open_store
-
     rates, settings = Rates(), overrides.settings()
-    with open_store(settings.database_url, say=say) as store:
+    with open_database(settings) as database:
         while True:
-            recordings, failed = look(store, map_name)
+            status = database.status(map_name)
+            recordings = status.recordings
             rates.look({recording.recording_id: recording.keyframes for recording in recordings})
             if json:
-                refined = refinements_of(store)
-                print_json([as_json(item, failed, refined.get(item.map_id, {})) for item in recordings])
+                refined = refinements_of(status.refinements)
+                print_json([as_json(item, status.failed, refined.get(item.map_id, {})) for item in recordings])
             else:
                 if watch and sys.stdout.isatty():
                     print("\033[2J\033[H", end="")  # clear, cursor to the top left
-                show(store, recordings, failed)
+                show(status)
                 if watch:
                     show_rates(recordings, rates)
-                show_workers(store, settings, everybody=watch)
+                show_workers(database, everybody=watch)
             if not watch or all(recording.state in ("complete", "deleting") for recording in recordings):
                 return
             time.sleep(SECONDS_BETWEEN_LOOKS)
@@ -77,7 +75,7 @@ class Rates:
         return (last.get(recording_id, 0) - first[recording_id]) / (last_s - first_s)
 
 
-def show_rates(recordings: list[RecordingStatus], rates: Rates) -> None:
+def show_rates(recordings: Sequence[RecordingStatus], rates: Rates) -> None:
     """Print rates and the time left of recordings that are not complete."""
     from semdb.cli.progress import format_duration
 
@@ -89,27 +87,25 @@ def show_rates(recordings: list[RecordingStatus], rates: Rates) -> None:
             print_lines(f"{recording.map}/{recording.name}: {left} to do, {measure(rate, 1)} keyframes/s{time_left}")
 
 
-def show_workers(store: Store, settings: Settings, *, everybody: bool) -> None:
+def show_workers(database: Database, *, everybody: bool) -> None:
     """Print who works on how much, with `everybody`; where a broker is set also what waits unsent, and who is idle."""
     from importlib import import_module
 
-    from semdb.database.items import unsent
-    from semdb.database.reporting import workers
     from semdb.errors import SemdbError
 
-    busy = workers(store.engine)
+    busy = database.workers()
     for worker in busy if everybody else ():
         late = " (its lease has run out)" if worker.seconds_left < 0 else ""
         print_lines(f"worker {worker.machine} process {worker.process}: {worker.items} keyframes in hand{late}")
-    if "broker_url" not in settings.model_fields_set:
+    if "broker_url" not in database.settings.model_fields_set:
         return
-    if waiting := unsent(store.engine):
+    if waiting := database.unsent():
         print_lines(
             f"{waiting} keyframes wait for which no message is known to be on its way: "
             "where no semdb ingest is at them, semdb ingest --resume sends them"
         )
     try:
-        found = import_module("semdb.workers").nodes(settings)
+        found = import_module("semdb.workers").nodes(database.settings)
     except (ImportError, SemdbError) as error:  # not installed, or the broker does not answer
         print_lines(f"workers: {error}")
         return
@@ -122,22 +118,15 @@ def show_workers(store: Store, settings: Settings, *, everybody: bool) -> None:
         print_lines("workers: none answers at the broker")
 
 
-def look(store: Store, map_name: str | None) -> tuple[list[RecordingStatus], list[FailedItem]]:
-    """The recordings of a map, or of all, and their keyframes that failed. Raises `NotFoundError`."""
-    recordings = store.status(None if map_name is None else store.find_map(map_name).id)
-    known = {recording.recording_id for recording in recordings}
-    return recordings, [item for item in store.failed_items() if item.recording_id in known]
-
-
-def refinements_of(store: Store) -> dict[int, dict[str, str]]:
+def refinements_of(refinements: Iterable[Refinement]) -> dict[int, dict[str, str]]:
     """By map: each step of `semdb refine` that was run, and whether it is ``current`` or ``stale``."""
     found: dict[int, dict[str, str]] = {}
-    for item in store.refinements():
+    for item in refinements:
         found.setdefault(item.map_id, {})[item.kind] = "current" if item.current else "stale"
     return found
 
 
-def as_json(recording: RecordingStatus, failed: list[FailedItem], refinements: dict[str, str]) -> dict[str, Any]:
+def as_json(recording: RecordingStatus, failed: Iterable[FailedItem], refinements: dict[str, str]) -> dict[str, Any]:
     """What `--json` prints for one recording. `refinements` are those of its map."""
     return {
         "id": recording.recording_id,
@@ -161,9 +150,10 @@ def as_json(recording: RecordingStatus, failed: list[FailedItem], refinements: d
     }
 
 
-def show(store: Store, recordings: list[RecordingStatus], failed: list[FailedItem]) -> None:
+def show(status: Status) -> None:
     """Print the table for people, and the first errors."""
-    print_lines(f"database: {store.url}")
+    recordings, failed = status.recordings, status.failed
+    print_lines(f"database: {status.url}")
     if not recordings:
         print_lines("no recordings yet: semdb ingest PATH")
         return
@@ -192,7 +182,7 @@ def show(store: Store, recordings: list[RecordingStatus], failed: list[FailedIte
     if len(failed) > ERRORS_SHOWN:
         print_lines(f"and {len(failed) - ERRORS_SHOWN} more; --json lists all")
     shown = {recording.map_id for recording in recordings}
-    for refined in store.refinements():
+    for refined in status.refinements:
         if refined.map_id in shown and not refined.current:
             print_lines(f"map {refined.map}: what semdb refine computed ({refined.kind}) is out of date")
 
@@ -203,17 +193,12 @@ def retry(overrides: Overrides, map_name: MapName = None) -> None:
 
     The next `semdb ingest` of their recording, or a worker, tries them again.
     """
-    from semdb.database.requeue import requeue_failed
-    from semdb.database.store import open_store
-
-    with open_store(overrides.settings().database_url) as store:
-        recordings = store.status(None if map_name is None else store.find_map(map_name).id)
+    with open_database(overrides.settings()) as database:
         total = 0
-        for recording in recordings:
-            number = requeue_failed(store.engine, recording.recording_id)
+        for recording, number in database.retry(map_name):
             total += number
             if number:
-                print_lines(f"{recording.map}/{recording.name}: {number} put back; run: {ingest_again(recording)}")
+                print_lines(f"{recording.map}/{recording.name}: {number} put back; {ingest_again(recording)}")
     if total:
         print_lines("or, where workers do it: semdb ingest --resume")
     else:
@@ -221,13 +206,16 @@ def retry(overrides: Overrides, map_name: MapName = None) -> None:
 
 
 def ingest_again(recording: RecordingStatus) -> str:
-    """The command that goes on with a recording: under its own name, in its own map, read as it was."""
+    """How to go on with a recording: the command with its own name and map that reads it as it was."""
     from semdb.recordings.options import option_of
     from semdb.recordings.source import parse_source
+    from semdb.types import FROM_MEMORY
 
+    if recording.format == FROM_MEMORY:
+        return "its frames came from a program: give them to Database.ingest again"
     source = parse_source(recording.source)
     words = ["semdb", "ingest", source.address, "--map", recording.map, "--name", recording.name]
     said = [] if source.camera is None else ["--camera", source.camera]
     for name, value in source.options.given().items():
         said += [option_of(name), value]
-    return for_shell([*words, *said])
+    return f"run: {for_shell([*words, *said])}"

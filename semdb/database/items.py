@@ -37,6 +37,7 @@ from semdb.database.clock import now_plus
 from semdb.database.records import ItemState, RecordingState
 from semdb.database.tables import ingest_items, recordings
 from semdb.shown import for_terminal
+from semdb.types import FROM_MEMORY
 
 LEASE_S = 60
 MOST_ATTEMPTS = 10  # claims without an outcome after which a keyframe is taken to kill its workers
@@ -225,7 +226,7 @@ def open_items(engine: Engine, recording_id: int, frames: Sequence[int]) -> list
 def unsent(engine: Engine) -> int:
     """How many keyframes wait for which no message is known to be on its way: never sent, lost, or sent long ago."""
     query = select(func.count()).select_from(ingest_items.join(recordings, recordings.c.id == _item.recording_id))
-    query = query.where(_item.state == ItemState.PENDING.value, _not_on_its_way(), _not_being_deleted())
+    query = query.where(_item.state == ItemState.PENDING.value, _not_on_its_way(), _for_workers())
     return int(retry.read(engine, lambda c: c.execute(query).scalar()) or 0)
 
 
@@ -234,8 +235,9 @@ def _not_on_its_way() -> ColumnElement[bool]:
     return or_(_item.lease_until.is_(None), _item.lease_until < now_plus())
 
 
-def _not_being_deleted() -> ColumnElement[bool]:
-    return recordings.c.state != RecordingState.DELETING.value
+def _for_workers() -> ColumnElement[bool]:
+    """Of a recording that is not being deleted, and whose frames others can read."""
+    return and_(recordings.c.state != RecordingState.DELETING.value, recordings.c.format != FROM_MEMORY)
 
 
 def lost(engine: Engine, recording_id: int | None = None, *, all_pending: bool = False) -> list[QueuedItems]:
@@ -255,7 +257,7 @@ def lost(engine: Engine, recording_id: int | None = None, *, all_pending: bool =
         connection.execute(_given_up(and_(expired, _item.attempts >= MOST_ATTEMPTS)))
         connection.execute(update(ingest_items).where(expired).values(state=ItemState.PENDING.value, **_NOT_HELD))
         query = select(recordings.c.id, recordings.c.source, _item.frame_index)
-        query = query.join(recordings, recordings.c.id == _item.recording_id).where(due, _not_being_deleted())
+        query = query.join(recordings, recordings.c.id == _item.recording_id).where(due, _for_workers())
         found: dict[tuple[int, str], list[int]] = {}
         for row in connection.execute(query.order_by(recordings.c.id, _item.frame_index)):
             found.setdefault((int(row.id), str(row.source)), []).append(int(row.frame_index))

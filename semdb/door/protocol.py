@@ -36,6 +36,8 @@ class SemanticDatabase(Protocol):
 
     def maps(self) -> list[MapInfo]: ...
 
+    def map(self, name: str) -> MapInfo: ...
+
     def models(self, map: str) -> tuple[ModelInfo, ...]: ...
 
     def recordings(self, map: str | None = None) -> list[RecordingStatus]: ...
@@ -45,7 +47,13 @@ class SemanticDatabase(Protocol):
     def keyframe(self, keyframe_id: int) -> Keyframe: ...
 
     def keyframes(
-        self, map: str, recording: str | None = None, *, after: int = 0, limit: int | None = None
+        self,
+        map: str | None = None,
+        recording: str | None = None,
+        *,
+        ids: Iterable[int] | None = None,
+        after: int = 0,
+        limit: int | None = None,
     ) -> list[Keyframe]: ...
 
     def sql(self, statement: str) -> Rows: ...

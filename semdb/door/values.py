@@ -207,7 +207,7 @@ class KeyframeContent(Protocol):
 
     def objects(self, keyframe_id: int) -> tuple[SeenObject, ...]: ...
 
-    def keypoints(self, keyframe_id: int) -> Keypoints: ...
+    def keypoints(self, keyframe_id: int) -> tuple[Keypoints, tuple[str, ...]]: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -258,8 +258,17 @@ class Keyframe:
 
     @property
     def keypoints(self) -> Keypoints:
-        """Local features with their 3D points in the camera's frame, without descriptors (``[n, 0]``)."""
-        found: Keypoints = self._kept("keypoints", lambda: self.content.keypoints(self.id))
+        """Local features with their 3D points in the camera's frame, without descriptors (``[n, 0]``).
+
+        ``object_index`` ``[n]`` is the position in `objects` and `categories`, -1 in the background.
+        """
+        found: Keypoints = self._kept("keypoints", lambda: self.content.keypoints(self.id))[0]
+        return found
+
+    @property
+    def categories(self) -> tuple[str, ...]:
+        """The class of each object, by ordinal."""
+        found: tuple[str, ...] = self._kept("keypoints", lambda: self.content.keypoints(self.id))[1]
         return found
 
     def picture(self) -> ImageArray:

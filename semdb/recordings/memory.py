@@ -23,9 +23,8 @@ from semdb.errors import FrameError, RecordingError, UsageError
 from semdb.recordings.arrays import CameraLike, as_camera, as_depth, as_image, as_pose, check_depth_scale
 from semdb.recordings.base import DroppedFrame, FrameEntry, Recording
 from semdb.recordings.images import encode_16bit, encode_color
-from semdb.types import Camera, Frame, InstanceMasks
+from semdb.types import FROM_MEMORY, Camera, Frame, InstanceMasks
 
-FORMAT = "frames"
 SOURCE = "frames from memory"
 DEPTH_SCALE = 5000.0  # of depth without a file: steps of 0.2 mm up to 13.1 m, exact for millimetres and for TUM's
 PATIENCE = 10  # frames from the beginning of which one at least must be usable
@@ -166,7 +165,7 @@ class _Spool:
         return Recording(
             path=self.folder,
             name=name,
-            format=FORMAT,
+            format=FROM_MEMORY,
             camera=self.camera,
             depth_scale=scale,
             total_frames=total,

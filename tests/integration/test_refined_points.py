@@ -125,12 +125,12 @@ def test_stale_points_are_not_used(store: Store, views: tuple[list[KeyframeRecor
     after = localizer.localize(query)  # the one that is open notices, and so does a new one
     assert after.refinements == {"points": "stale"}
     assert after.inliers < before.inliers
-    assert refinements_of(store) == {info.id: {"classes": "stale", "points": "stale"}}
+    assert refinements_of(store.refinements()) == {info.id: {"classes": "stale", "points": "stale"}}
     fresh = make_localizer(store, info, "sql", say=said.append)
     assert "not used: run semdb refine" in said[-1]
     assert fresh.localize(query).inliers == after.inliers
     refine_map(store, info)
-    assert refinements_of(store) == {info.id: {"classes": "current", "points": "current"}}
+    assert refinements_of(store.refinements()) == {info.id: {"classes": "current", "points": "current"}}
     ids, _ = store.poses(info.id)
     store.delete_keyframes(ids[:1])  # its row goes with it
     assert set(by_frame(store, info)) == set(range(1, FRAMES))

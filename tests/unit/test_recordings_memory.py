@@ -12,8 +12,8 @@ import pytest
 
 from semdb.errors import FrameError, RecordingError, UsageError
 from semdb.recordings import open_recording
-from semdb.recordings.memory import DEPTH_SCALE, FORMAT, SOURCE, check_frame, make_frame, recording_of
-from semdb.types import Camera, Frame, InstanceMasks
+from semdb.recordings.memory import DEPTH_SCALE, SOURCE, check_frame, make_frame, recording_of
+from semdb.types import FROM_MEMORY, Camera, Frame, InstanceMasks
 
 CAMERA = (30.0, 30.0, 15.5, 11.5)
 
@@ -36,7 +36,7 @@ def test_frames_of_a_recording_come_back_as_they_are(room: Path) -> None:
     """What readers of files give goes through memory unchanged: the same bytes, depth, masks, poses, camera."""
     source = open_recording(room)
     with recording_of(source.frames(), "again") as recording:
-        assert (recording.name, recording.format, recording.source) == ("again", FORMAT, SOURCE)
+        assert (recording.name, recording.format, recording.source) == ("again", FROM_MEMORY, SOURCE)
         assert (recording.total_frames, len(recording.entries)) == (24, 24)
         assert (recording.camera, recording.depth_scale) == (source.camera, source.depth_scale)
         assert recording.categories == source.categories or set(recording.categories or {}) <= set(source.categories)
