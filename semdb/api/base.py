@@ -29,7 +29,7 @@ class Base:
         """Writes what indexes have not on disk yet, and lets go of connections and networks."""
         self._here.close()
 
-    def connect(self) -> None:
+    def check(self) -> None:
         """Connects now, and not when it is first asked for something. Raises DatabaseError, SchemaError."""
         self._store()
 

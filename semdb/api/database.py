@@ -39,7 +39,7 @@ def open_database(url: str | PathLike[str] | None = None, *, say: Say | None = N
     database = Database(settings_with(given), say=say)
     path = sqlite_path(parse_url(database.settings.database_url))
     if path is None or (path.exists() and path.stat().st_size):
-        database.connect()  # says now what would be wrong later
+        database.check()  # says now what would be wrong later
     return database
 
 

@@ -130,7 +130,7 @@ def _resume(settings: Settings, *, json: bool) -> None:
     from semdb.cli.output import print_json, print_lines
 
     with open_database(settings) as database:
-        database.connect()
+        database.check()
         sent = database.resume(_send())
     if json:
         print_json({"sent": sent})
