@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from os import PathLike
     from typing import Any
 
-    from semdb.api import Answer, Database, Keyframe, Rows, SeenObject, SemanticDatabase
+    from semdb.api import Answer, Database, Keyframe, Rows, Seen, SeenObject, SemanticDatabase
     from semdb.errors import SemdbError
     from semdb.recordings.memory import make_frame
     from semdb.recordings.options import ReadOptions
@@ -29,6 +29,7 @@ _LAZY = {
     "Keyframe": "semdb.api",
     "ReadOptions": "semdb.recordings.options",
     "Rows": "semdb.api",
+    "Seen": "semdb.api",
     "SeenObject": "semdb.api",
     "SemanticDatabase": "semdb.api",
     "SemdbError": "semdb.errors",
@@ -44,6 +45,7 @@ __all__ = [
     "Keyframe",
     "ReadOptions",
     "Rows",
+    "Seen",
     "SeenObject",
     "SemanticDatabase",
     "SemdbError",

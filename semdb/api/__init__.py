@@ -3,6 +3,17 @@
 from semdb.api.database import Database, open_database
 from semdb.api.reading import Status
 from semdb.door.protocol import SemanticDatabase
+from semdb.door.seen import Seen
 from semdb.door.values import Answer, Keyframe, Rows, SeenObject
 
-__all__ = ["Answer", "Database", "Keyframe", "Rows", "SeenObject", "SemanticDatabase", "Status", "open_database"]
+__all__ = [
+    "Answer",
+    "Database",
+    "Keyframe",
+    "Rows",
+    "Seen",
+    "SeenObject",
+    "SemanticDatabase",
+    "Status",
+    "open_database",
+]

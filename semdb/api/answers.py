@@ -54,6 +54,8 @@ def answer_of(found: ImageLocalization, store: Callable[[], Store]) -> Answer:
         keyframes_matched=localization.keyframes_matched,
         refinements=localization.refinements,
         timing_ms=localization.timing_ms,
+        frame_index=query.frame_index,
+        timestamp_ns=query.timestamp_ns,
         draw=draw,
     )
 

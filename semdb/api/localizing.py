@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
@@ -16,7 +17,8 @@ from semdb.errors import DatabaseError, FrameError, NotFoundError, UsageError
 
 if TYPE_CHECKING:  # the rooms behind are entered when something is asked of them: they take a second to import
     from semdb.localization.open_maps import OpenMap
-    from semdb.localization.query_image import Depth, Image, LikeCamera, PathText
+    from semdb.localization.query_image import Depth, Image, LikeCamera, PathText, QueryImage, QueryReader
+    from semdb.recordings import FrameEntry, ReadOptions, Recording
     from semdb.recordings.arrays import CameraLike
     from semdb.types import Localization
 
@@ -117,14 +119,93 @@ class Localizing(Base):
 
         An image that cannot be read is told to `unreadable`, where that is given, and the others go on.
         """
-        from semdb.localization.open_maps import ask
-        from semdb.localization.query_image import QueryReader
-        from semdb.recordings.arrays import as_camera
-
         if depth and len(depth) != len(images):
             raise UsageError(f"{len(depth)} depth images for {len(images)} images: give --depth once per image")
         if names is not None and len(names) != len(images):
             raise UsageError(f"{len(names)} names for {len(images)} images: give one each")
+
+        def read(number: int, reader: QueryReader) -> QueryImage:
+            own, name = depth[number] if depth else None, None if names is None else names[number]
+            return reader.read(images[number], own, name, number if len(images) > 1 else None)
+
+        items = (partial(read, number) for number in range(len(images)))
+        return self._answers(items, map, camera, like, coarse, depth_scale=depth_scale, log=log, unreadable=unreadable)
+
+    def localize_recording(
+        self,
+        recording: PathText | Recording,
+        *,
+        map: str | None = None,
+        camera: CameraLike | None = None,
+        reading: ReadOptions | None = None,
+        like: PathText | None = None,
+        every: int = 1,
+        query_depth: bool = False,
+        coarse: str = "index",
+        log: bool = True,
+        unreadable: Callable[[FrameError], None] | None = None,
+    ) -> Iterator[Answer]:
+        """Where the frames of a recording were taken, one by one, or `every` so many of them.
+
+        Poses that it may have are for pictures only; with `query_depth` its depth takes part. The camera is `camera`,
+        else that of `like`, else the recording's own; `reading` says what its files do not. A frame that cannot be
+        decoded is told to `unreadable`, where that is given, and the others go on. Raises RecordingError, and what
+        `localize` raises.
+        """
+        opened = self.open_recording(recording, map=map, camera=camera, reading=reading, like=like)
+        if every < 1:
+            raise UsageError(f"every={every}: one frame in how many? From 1 on")
+        items = (partial(_read_frame, opened, entry, query_depth) for entry in opened.entries[::every])
+        return self._answers(items, map, None, None, coarse, log=log, unreadable=unreadable)
+
+    def open_recording(
+        self,
+        recording: PathText | Recording,
+        *,
+        map: str | None = None,
+        camera: CameraLike | None = None,
+        reading: ReadOptions | None = None,
+        like: PathText | None = None,
+    ) -> Recording:
+        """The recording of a folder or file with the camera that `localize_recording` takes, nothing decoded yet.
+
+        What had to be assumed, and how many frames cannot be used, is said. Raises RecordingError, UsageError.
+        """
+        from semdb.recordings import open_recording
+        from semdb.recordings.arrays import as_camera
+        from semdb.recordings.base import Recording as Opened
+
+        if isinstance(recording, Opened):
+            return recording
+        chosen = None if camera is None else as_camera(camera)
+        if chosen is None and like is not None:
+            chosen = self._like(self._here.maps().asked(map, "sql"), str(like)).camera
+        opened = open_recording(Path(recording), chosen, reading)
+        for line in opened.said:
+            self._say(f"{opened.name}: {line}")
+        if opened.dropped:
+            first = opened.dropped[0]
+            count = f"{len(opened.dropped)} of {opened.total_frames} frames cannot be used"
+            self._say(f"{opened.name}: {count}; the first, {first.name}: {first.reason}")
+        return opened
+
+    def _answers(
+        self,
+        items: Iterable[Callable[[QueryReader], QueryImage]],
+        map: str | None,
+        camera: CameraLike | None,
+        like: PathText | None,
+        coarse: str,
+        *,
+        depth_scale: float | None = None,
+        log: bool,
+        unreadable: Callable[[FrameError], None] | None,
+    ) -> Iterator[Answer]:
+        """Reads the items one after the other and asks the maps as they are then."""
+        from semdb.localization.open_maps import ask
+        from semdb.localization.query_image import QueryReader
+        from semdb.recordings.arrays import as_camera
+
         store, open_maps = self._store(), self._here.maps()
         maps = open_maps.asked(map, coarse)
         reader = QueryReader(
@@ -135,11 +216,10 @@ class Localizing(Base):
             on_disk=self._here.on_disk(),
             say=self._say,
         )
-        for number, image in enumerate(images):
+        for number, read in enumerate(items):
             started = time.perf_counter()
-            name = None if names is None else names[number]
             try:
-                query = reader.read(image, depth[number] if depth else None, name, number if len(images) > 1 else None)
+                query = read(reader)
             except FrameError as error:
                 if unreadable is None:
                     raise
@@ -177,3 +257,20 @@ class Localizing(Base):
             store.log_query(map_id, image, localization)
         except DatabaseError as error:
             self._say(f"the answer for {image} is not in the log of queries: {error}")
+
+
+def _read_frame(recording: Recording, entry: FrameEntry, with_depth: bool, reader: QueryReader) -> QueryImage:
+    """One frame of a recording as a query. Raises FrameError that names the file."""
+    from semdb.types import Frame
+
+    frame = Frame(
+        index=entry.index,
+        name=entry.name,
+        timestamp_ns=entry.timestamp_ns,
+        image=recording.read_image(entry),
+        depth=recording.read_depth(entry) if with_depth else None,
+        camera=recording.camera_of(entry),
+        world_from_camera=entry.world_from_camera,
+        instances=recording.read_instances(entry),
+    )
+    return reader.read(frame, name=recording.name_of(entry))

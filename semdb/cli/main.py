@@ -33,6 +33,7 @@ COMMANDS: dict[str, str] = {
     "refine": "semdb.cli.refine",
     "localize": "semdb.cli.localize",
     "evaluate": "semdb.cli.evaluate",
+    "show": "semdb.cli.show",
     "sql": "semdb.cli.sql",
     "keypoints": "semdb.cli.keypoints",
     "models": "semdb.cli.models",

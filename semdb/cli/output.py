@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import os
 import sys
 import textwrap
 from collections import Counter
@@ -12,11 +13,12 @@ from collections.abc import Iterable, Sequence
 from datetime import date, datetime, time, timedelta
 from decimal import Decimal
 from itertools import chain
-from typing import Any, TextIO
+from typing import Any, Self, TextIO
 
 from semdb.shown import for_json, for_terminal, number, width
 
 FORMATS = ("table", "csv", "json")
+_COLOURS = {"green": "32", "yellow": "33", "red": "31"}
 MOST_HELD = 2**25  # characters of rows in memory, of statements that may give any number of them
 
 
@@ -65,6 +67,45 @@ def print_lines(*lines: str) -> None:
     """Print lines for people on stdout, each as one line whatever names it holds."""
     for line in lines:
         print(for_terminal(line), flush=True)
+
+
+def painted(text: str, colour: str) -> str:
+    """`text` in a colour (``green``, ``yellow``, ``red``) where stdout is a terminal that shows it, else as it is."""
+    if not sys.stdout.isatty() or os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
+        return text
+    return f"\x1b[{_COLOURS[colour]}m{text}\x1b[0m"
+
+
+def print_painted(before: str, word: str, after: str, *, colour: str) -> None:
+    """As `print_lines`, a line with a `word` in a colour."""
+    print(for_terminal(before) + painted(for_terminal(word), colour) + for_terminal(after), flush=True)
+
+
+class JsonList:
+    """Prints a list as `print_json` does, each item when it is added. A context manager that ends the list.
+
+    After an error the list ends with the items that were there; without any nothing is printed.
+    """
+
+    def __init__(self, stream: TextIO | None = None) -> None:
+        self._stream = stream or sys.stdout
+        self._begun = False
+
+    def add(self, value: Any) -> None:
+        """Prints an item."""
+        text = "\n".join(f"  {line}" for line in _json(value).split("\n"))
+        self._stream.write((",\n" if self._begun else "[\n") + text)
+        self._stream.flush()
+        self._begun = True
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if self._begun:
+            self._stream.write("\n]\n")
+        elif kind is None:
+            self._stream.write("[]\n")
 
 
 def print_json(value: Any, stream: TextIO | None = None) -> None:

@@ -40,7 +40,11 @@ def _chunked(
 
 
 def _ints(keys: Sequence[int]) -> list[int]:
-    return [int(key) for key in keys]  # numpy's integers are not what drivers take
+    """Numpy's integers are not what drivers take, and larger ones than 64 bits nobody's. Raises NotFoundError."""
+    for key in keys:
+        if not -(2**63) <= key < 2**63:
+            raise NotFoundError(f"there is no keyframe {key}")
+    return [int(key) for key in keys]
 
 
 def _missing(keys: Sequence[int], found: Any, what: str) -> None:

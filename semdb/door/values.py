@@ -97,7 +97,8 @@ class Answer:
     The pose is metres in the map's world frame, camera axes x right, y down, z forward; the covariance is of
     translation (m), then rotation (rad, left perturbation in the world frame). `confidence` is the probability 0..1
     that the pose is right. `objects` are those that were seen in the image, `candidates` the keyframes that were looked
-    at. `timing_ms` has the wall time of each part and their `total`.
+    at. `timing_ms` has the wall time of each part and their `total`. Of a frame of a recording `frame_index` is its
+    number and `timestamp_ns` its time, where the recording has times.
     """
 
     image: str  # its path, or the name that was given with the array
@@ -115,6 +116,8 @@ class Answer:
     keyframes_matched: int
     refinements: Mapping[str, str]
     timing_ms: Mapping[str, float]
+    frame_index: int | None = None
+    timestamp_ns: int | None = None
     draw: Callable[[], ImageArray] | None = field(default=None, repr=False)
 
     @property
@@ -159,6 +162,8 @@ class Answer:
         """What ``semdb localize --json`` prints for an image."""
         return {
             "image": self.image,
+            "frame_index": self.frame_index,
+            "timestamp_ns": self.timestamp_ns,
             "verdict": str(self.verdict),
             "map": self.map,
             "pose": None
@@ -273,10 +278,11 @@ class Keyframe:
 
     def picture(self) -> ImageArray:
         """The image with its objects, RGB uint8 ``[H, W, 3]``."""
-        from semdb.pictures.drawing import draw_image
+        from semdb.pictures.drawing import description_facts, draw_image
 
         title = f"keyframe {self.id}: {self.recording}, frame {self.frame_index}"
-        return draw_image(self.image, [thing.detection() for thing in self.objects], title=title)
+        facts = description_facts(len(self.objects), self.keypoints)
+        return draw_image(self.image, [thing.detection() for thing in self.objects], title=title, facts=facts)
 
     def save(self, path: str | Path) -> Path:
         """Writes the picture as a PNG or JPEG file. Returns its path."""

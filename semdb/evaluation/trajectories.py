@@ -8,8 +8,7 @@ from pathlib import Path
 
 from semdb.errors import UsageError
 from semdb.evaluation.metrics import EvaluationResult, QueryResult
-from semdb.geometry import quat_wxyz_from_rotation
-from semdb.types import FloatArray
+from semdb.geometry.tum import TUM_COLUMNS, tum_line
 
 LONGEST_STEM = 200  # bytes, of the 255 that file systems take
 INDEX_NOTE = "frames have no time stamps: the first column is the frame index, in seconds"
@@ -62,7 +61,7 @@ def trajectory_text(queries: Iterable[QueryResult], *, estimated: bool) -> str:
     rows = sorted(queries, key=lambda query: (query.timestamp_ns or 0, query.frame_index))
     timed = all(query.timestamp_ns is not None for query in rows)
     what = "estimated poses of the localized queries" if estimated else "true poses of all queries"
-    lines = [f"# {what}, world from camera, metres", "# timestamp tx ty tz qx qy qz qw"]
+    lines = [f"# {what}, world from camera, metres", TUM_COLUMNS]
     if not timed:
         lines.insert(1, f"# {INDEX_NOTE}")
     for query in rows:
@@ -70,10 +69,5 @@ def trajectory_text(queries: Iterable[QueryResult], *, estimated: bool) -> str:
         if pose is None or (estimated and not query.is_localized):
             continue
         nanoseconds = query.timestamp_ns if timed and query.timestamp_ns is not None else query.frame_index * 10**9
-        lines.append(f"{nanoseconds // 10**9}.{nanoseconds % 10**9:09d} {_pose_text(pose)}")
+        lines.append(tum_line(nanoseconds, pose))
     return "\n".join(lines) + "\n"
-
-
-def _pose_text(pose: FloatArray) -> str:
-    w, x, y, z = quat_wxyz_from_rotation(pose[:3, :3])
-    return " ".join(f"{value:.9f}" for value in (*pose[:3, 3], x, y, z, w))

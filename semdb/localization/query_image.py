@@ -33,6 +33,7 @@ class QueryImage:
     """`name` is the path of a file, or what the image in memory is to be called.
 
     `world_from_camera` is the true pose where the image belongs to a recording that has one: for pictures only.
+    Of a frame of a recording `frame_index` is its number, `timestamp_ns` its time where the recording has times.
     """
 
     name: str
@@ -41,6 +42,8 @@ class QueryImage:
     depth: Float32Array | None
     instances: InstanceMasks | None
     world_from_camera: FloatArray | None
+    frame_index: int | None = None
+    timestamp_ns: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +98,8 @@ class QueryReader:
     The camera is, in this order, `camera` (from ``--camera``), that of a frame, that of `like` (from ``--like``), that
     of the recording on disk that the image belongs to, `known` when all the map's keyframes have one camera of that
     size. Depth has `depth_scale` units per metre, or those of `like`, or of the recording; floats in memory are metres.
+    With `nominal` an image without depth whose camera is not known gets that of a usual lens, for where nothing is
+    measured.
     """
 
     def __init__(
@@ -106,7 +111,9 @@ class QueryReader:
         depth_scale: float | None = None,
         on_disk: RecordingsOnDisk | None = None,
         say: Say | None = None,
+        nominal: bool = False,
     ) -> None:
+        self._nominal = nominal
         self._camera = camera
         self._like = like
         self._known = known
@@ -141,12 +148,12 @@ class QueryReader:
         way_out = "--camera fx,fy,cx,cy[,k1,k2,p1,p2,k3], or --like RECORDING"
         camera, scale = self._camera_of(str(path), size, found, way_out)
         depth_image = self._read_depth(depth, str(path), size, scale)
-        instances, pose = None, None
+        instances, pose, index, time = None, None, None, None
         if found is not None:
             recording, entry = found
-            pose = entry.world_from_camera
+            pose, index, time = entry.world_from_camera, entry.index, entry.timestamp_ns
             instances = recording.read_instances(entry)
-        return QueryImage(str(path), image, camera, depth_image, instances, pose)
+        return QueryImage(str(path), image, camera, depth_image, instances, pose, index, time)
 
     def _of_frame(self, given: Frame, depth: Depth | None, name: str | None) -> QueryImage:
         frame = check_frame(given)
@@ -154,7 +161,16 @@ class QueryReader:
         camera = frame.camera if self._camera is None else with_size(self._camera, size)
         scale = self._depth_scale or (None if self._like is None else self._like.depth_scale)
         found = frame.depth if depth is None else self._read_depth(depth, frame.name, size, scale)
-        return QueryImage(name or frame.name, frame.image, camera, found, frame.instances, frame.world_from_camera)
+        return QueryImage(
+            name or frame.name,
+            frame.image,
+            camera,
+            found,
+            frame.instances,
+            frame.world_from_camera,
+            frame.index,
+            frame.timestamp_ns,
+        )
 
     def _read_depth(
         self, depth: Depth | None, name: str, size: tuple[int, int], scale: float | None
@@ -195,6 +211,8 @@ class QueryReader:
         if len(fitting) == 1:
             self._tell("camera of the images: that of the map's keyframes (--camera or --like name another)")
             return fitting.pop(), scale
+        if self._nominal:
+            return Camera(*size, size[0], size[0], (size[0] - 1) / 2, (size[1] - 1) / 2), scale
         raise FrameError(f"the camera of {name} ({size[0]}x{size[1]}) is not known: give {way_out}")
 
     def _tell(self, line: str) -> None:

@@ -22,7 +22,7 @@ from matplotlib.text import Text
 
 from semdb.geometry import quat_wxyz_from_rotation
 from semdb.shown import for_plot, measure
-from semdb.types import Detection, Float32Array, ImageArray, IntArray, Localization, Verdict
+from semdb.types import Detection, Float32Array, ImageArray, IntArray, Keypoints, Localization, Verdict
 
 Colour = tuple[float, float, float]
 
@@ -154,14 +154,16 @@ def draw_localization(
     return figure_to_image(figure)
 
 
-def draw_image(image: ImageArray, detections: Sequence[Detection], *, title: str) -> ImageArray:
+def draw_image(
+    image: ImageArray, detections: Sequence[Detection], *, title: str, facts: Sequence[tuple[str, str]] = ()
+) -> ImageArray:
     """One image with object masks, class names and scores under a `title`, RGB ``[H, W, 3]``.
 
-    `image` is RGB ``[H, W, 3]`` of any size; it is drawn 720 pixels high.
+    `image` is RGB ``[H, W, 3]`` of any size; it is drawn 720 pixels high. `facts` are (name, value) pairs below it.
     """
     colours = category_colours(detection.category for detection in detections)
     pane = _pane_for(image, MARGIN)
-    width, height = pane.width + 2 * MARGIN, HEADER + PANE_HEIGHT + MARGIN
+    width, height = pane.width + 2 * MARGIN, HEADER + PANE_HEIGHT + (FOOTER if facts else MARGIN)
     sheet = np.full((height, width, 3), 255, np.uint8)
     _paste(sheet, pane, image, detections, colours)
     figure, axes = blank_figure(width, height)
@@ -169,7 +171,20 @@ def draw_image(image: ImageArray, detections: Sequence[Detection], *, title: str
     _draw_labels(axes, pane, detections, colours)
     head = axes.text(MARGIN, HEADER / 2, for_plot(title), color=INK, fontsize=15, weight="bold", va="center")
     _fit(head, width - 2 * MARGIN)
+    _draw_facts(axes, MARGIN, height - FOOTER / 2, facts)
     return figure_to_image(figure)
+
+
+def description_facts(objects: int, keypoints: Keypoints, *, points: bool = True) -> list[tuple[str, str]]:
+    """What the caption of a described image says: objects, keypoints, those on objects and, with `points`, in 3D."""
+    facts = [
+        ("objects", str(objects)),
+        ("keypoints", str(len(keypoints))),
+        ("on objects", str(int((keypoints.object_index >= 0).sum()))),
+    ]
+    if points:
+        facts.append(("with a 3D point", str(int(np.isfinite(keypoints.points[:, 2]).sum()))))
+    return facts
 
 
 def localization_facts(localization: Localization, error: tuple[float, float] | None = None) -> list[tuple[str, str]]:
@@ -334,7 +349,11 @@ def _draw_caption(axes: Axes, y: float, verdict: Verdict, facts: Sequence[tuple[
         MARGIN + 10, y, str(verdict), color="white", fontsize=15, weight="bold", va="center",
         bbox={"boxstyle": "round,pad=0.45", "fc": VERDICT_COLOURS[verdict], "ec": "none"},
     )  # fmt: skip
-    x = _right_edge(chip) + 48
+    _draw_facts(axes, _right_edge(chip) + 48, y, facts)
+
+
+def _draw_facts(axes: Axes, x: float, y: float, facts: Sequence[tuple[str, str]]) -> None:
+    """Names over values from `x` on, side by side."""
     for name, value in facts:
         head = axes.text(x, y - 15, for_plot(name), color=FAINT, fontsize=10.5, va="center")
         body = axes.text(x, y + 11, for_plot(value), color=INK, fontsize=14, va="center")

@@ -65,11 +65,16 @@ def test_lines_are_split_as_a_shell_does(line: str, expected: Line) -> None:
         ("semdb localize --map ", ["hall 2", "room"]),
         ("semdb localize --map=r", ["room"]),
         ("semdb localize --map room --m", []),  # given once is enough
-        ("semdb localize --depth a.png --dep", ["--depth"]),  # may be repeated
+        (
+            "semdb localize --depth a.png --dept",
+            ["--depth", "--depth-scale", "--depth-offset-ms", "--depth-topic"],
+        ),  # may be repeated
         ("semdb localize --like ", ["corridor", "first visit", "FILES"]),
         ("semdb localize --coarse ", ["sql", "index"]),
         ("semdb localize ", ["FILES"]),
         ("semdb localize --plot ", ["FILES"]),
+        ("semdb localize --traj", ["--trajectory"]),
+        ("semdb show ", ["FILES"]),
         ("semdb localize --camera ", []),
         ("semdb localize -- --", ["FILES"]),
         ("semdb ingest ", ["FILES"]),

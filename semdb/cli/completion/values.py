@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sqlite3
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -13,7 +14,7 @@ Given = Mapping[str, str]
 Environment = Mapping[str, str]
 
 MOST_NAMES = 200
-PATH_METAVARS = ("PATH", "FILE", "FOLDER", "DIR", "IMAGE")
+_PATHS = re.compile(r"\b(PATH|FILE|FOLDER|DIR|IMAGE)\b")  # words of metavars
 METHODS = ("semdb", "cnn", "paper", "chen", "sift-reference", "oracle", "colmap")
 FIXED: Mapping[str, Entries] = {
     "--features": (("surf", "SURF, 64 dimensions"), ("sift", "SIFT"), ("orb", "ORB, binary")),
@@ -57,7 +58,7 @@ def _of_type(parameter: Any) -> tuple[Entries, bool]:
     choices = getattr(kind, "choices", None)
     if choices is not None:
         return [(str(getattr(choice, "value", choice)), "") for choice in choices], False
-    return (), str(parameter.metavar or "").lstrip("[").startswith(PATH_METAVARS)
+    return (), bool(_PATHS.search(str(parameter.metavar or "")))
 
 
 def _maps(given: Given, environment: Environment) -> tuple[Entries, bool]:
