@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from semdb.api.reading import Reading
 from semdb.database.records import Deleted, RecordingStatus
-from semdb.errors import UsageError
+from semdb.errors import DatabaseUnavailableError, SemdbError, UsageError
 
 if TYPE_CHECKING:  # the rooms behind are entered when something is asked of them: they take a second to import
     from semdb.door.protocol import Source
@@ -133,7 +133,8 @@ class Writing(Reading):
     ) -> list[StepResult]:
         """Computes what needs more than one keyframe, where it is out of date, of a map or of all that hold keyframes.
 
-        Raises UsageError for a step that is none, NotFoundError, DatabaseError.
+        One map that cannot be refined keeps none of the others: its error is raised when they are done. Raises
+        UsageError for a step that is none, NotFoundError, DatabaseError.
         """
         from semdb.refinement.run import refine_map, steps_of
 
@@ -141,8 +142,16 @@ class Writing(Reading):
         store = self._store()
         infos = [store.find_map(map)] if map is not None else [info for info in store.maps() if info.keyframes]
         results: list[StepResult] = []
+        first: SemdbError | None = None
         for info in infos:
-            results += refine_map(store, info, kinds=steps, force=force, progress=progress)
+            try:
+                results += refine_map(store, info, kinds=steps, force=force, progress=progress)
+            except DatabaseUnavailableError:
+                raise
+            except SemdbError as error:
+                first = first or error
+        if first is not None:
+            raise first
         return results
 
     def delete(

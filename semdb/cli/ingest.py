@@ -21,7 +21,11 @@ from semdb.cli.options import (
 )
 from semdb.shown import measure
 
+FRAMES_SHOWN = 5
+
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from semdb.ingestion.queue import Send
     from semdb.ingestion.run import IngestSummary
     from semdb.settings import Settings
@@ -162,12 +166,23 @@ def as_json(summary: IngestSummary) -> dict[str, object]:
         "failed": {str(index): reason for index, reason in summary.failed.items()},
         "objects": summary.objects,
         "keypoints": summary.keypoints,
+        "without_keypoints": summary.blank,
         "dropped": [{"name": dropped.name, "reason": dropped.reason} for dropped in summary.dropped],
         "models": {model.role: model.name for model in summary.models},
         "notes": list(summary.notes),
         "findings": [asdict(finding) for finding in summary.findings],
         "seconds": summary.seconds or None,
     }
+
+
+def blank_text(frames: Sequence[int]) -> list[str]:
+    """A line where keyframes show nothing."""
+    if not frames:
+        return []
+    some = ", ".join(map(str, frames[:FRAMES_SHOWN])) + (", ..." if len(frames) > FRAMES_SHOWN else "")
+    return [
+        f"{len(frames)} without a keypoint (dark, blank or out of focus), nothing is matched with them: frame {some}"
+    ]
 
 
 def as_lines(summary: IngestSummary) -> list[str]:
@@ -186,6 +201,7 @@ def as_lines(summary: IngestSummary) -> list[str]:
         f"keyframes  {summary.planned} planned, {summary.stored} stored now, {summary.already_stored} stored before"
         f", {len(summary.failed)} failed" + (f", {summary.elsewhere} by other processes" if summary.elsewhere else ""),
         *(f"           frame {index}: {reason}" for index, reason in summary.failed.items()),
+        *(f"           {line}" for line in blank_text(summary.blank)),
         f"objects    {summary.objects} with {summary.keypoints} keypoints in all",
         f"models     {', '.join(model.name for model in summary.models)}",
         f"seconds    {seconds['total']:.1f}{rate}; selection {seconds['select']:.1f}; {stages}",

@@ -21,19 +21,29 @@ def command(
 ) -> None:
     """Compute what needs more than one keyframe: which classes the detector takes for each other.
 
-    Nothing else depends on it: ingest, deletion and localization work without. Does only what is out of date.
+    Nothing else depends on it: ingest, deletion and localization work without. Does only what is out of date. A map
+    that cannot be refined is named, and makes the exit code 1; the others are refined all the same.
     """
     from semdb.cli.output import print_json, print_lines
     from semdb.cli.progress import StagedProgress, say
+    from semdb.errors import DatabaseUnavailableError, SemdbError
     from semdb.refinement.run import steps_of
 
     steps_of(step or ())
     done: list[dict[str, Any]] = []
+    failed: list[SemdbError] = []
     with open_database(overrides.settings()) as database:
         names = [map_name] if map_name is not None else [info.name for info in database.maps() if info.keyframes]
         for name in names:
-            with StagedProgress() as progress:
-                results = database.refine(name, steps=step or (), force=force, progress=progress.update)
+            try:
+                with StagedProgress() as progress:
+                    results = database.refine(name, steps=step or (), force=force, progress=progress.update)
+            except SemdbError as error:
+                if len(names) == 1 or isinstance(error, DatabaseUnavailableError):
+                    raise
+                failed.append(error)
+                say(f"{name}: not refined: {error}")
+                continue
             for result in results:
                 state = "computed" if result.computed else "up to date"
                 if not json:
@@ -53,3 +63,5 @@ def command(
         print_json(done)
     elif not names:
         say("there is no keyframe to refine: ingest a recording first")
+    if failed:
+        raise typer.Exit(failed[0].exit_code)

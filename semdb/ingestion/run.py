@@ -65,6 +65,8 @@ class IngestOptions:
 class IngestSummary:
     """What became of one recording. `elsewhere` counts keyframes that other processes stored meanwhile.
 
+    `blank` are frames that were stored without a keypoint: nothing can be matched with them.
+
     `seconds` are the wall times of stages, summed over keyframes: stages overlap, so they are more than the `total`.
     Networks' time is in detect and encode.
     """
@@ -81,6 +83,7 @@ class IngestSummary:
     elsewhere: int = 0
     objects: int = 0
     keypoints: int = 0
+    blank: list[int] = field(default_factory=list)
     failed: dict[int, str] = field(default_factory=dict)
     dropped: tuple[DroppedFrame, ...] = ()
     notes: tuple[str, ...] = ()
@@ -297,6 +300,8 @@ def _count(summary: IngestSummary, item: Item) -> None:
         summary.stored += 1
         summary.objects += item.objects
         summary.keypoints += item.keypoints
+        if not item.keypoints:
+            summary.blank.append(item.claim.frame_index)
 
 
 def default_map_name(recording: Recording) -> str:
