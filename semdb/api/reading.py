@@ -97,6 +97,13 @@ class Reading(Base):
         self._here.check_open()
         return Rows(*run_readonly(self.settings, statement))
 
+    def tables(self) -> dict[str, tuple[str, ...]]:
+        """The columns of each table and view that `sql` can ask. Raises what `sql` raises."""
+        from semdb.database.catalogue import tables_and_columns
+
+        self._here.check_open()
+        return tables_and_columns(self.settings)
+
     def status(self, map: str | None = None) -> Status:
         """The recordings of a map, or of all, what failed of them, and what `refine` has computed."""
         store = self._store()

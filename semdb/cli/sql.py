@@ -59,8 +59,10 @@ def command(
 def run(settings: Settings, statement: str, fmt: Format) -> None:
     """Runs one statement and prints its rows."""
     from semdb.cli.output import print_rows
+    from semdb.cli.sql_text import say_renamed
 
     with open_database(settings) as database, database.sql(statement) as rows:
+        say_renamed(rows.columns, fmt)
         print_rows(rows.columns, rows, fmt)
 
 
@@ -104,10 +106,8 @@ def prompt(settings: Settings, fmt: Format) -> None:
     """Reads statements from the terminal until there are no more."""
     from semdb.cli.output import print_lines
     from semdb.cli.sql_prompt import Prompt
-    from semdb.database.catalogue import tables_and_columns
-    from semdb.database.engine import parse_url, safe_url
 
-    known = tables_and_columns(settings)  # says at once when there is no database
-    where = safe_url(parse_url(settings.database_url))
-    print_lines(f"{where}: {len(known)} tables and views; ? for help, Ctrl-D leaves")
-    Prompt(settings, fmt, known).run()
+    with open_database(settings) as database:
+        known = database.tables()  # says at once when there is no database
+        print_lines(f"{database.url}: {len(known)} tables and views; ? for help, Ctrl-D leaves")
+        Prompt(database, fmt, known).run()

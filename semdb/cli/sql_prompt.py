@@ -11,12 +11,14 @@ import time
 from collections.abc import Iterator, Mapping
 from itertools import islice
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from semdb.cli.options import open_database
 from semdb.cli.output import print_lines, print_rows
 from semdb.cli.sql_text import Statement, say_renamed, statements
 from semdb.errors import SemdbError, UsageError
-from semdb.settings import Settings
+
+if TYPE_CHECKING:
+    from semdb.api import Database
 
 MOST_ROWS = 1000  # that a prompt prints
 HISTORY_LINES = 2000
@@ -36,9 +38,9 @@ docs/sql.md has questions to start from."""
 class Prompt:
     """Reads statements and prints what they give until there are no more."""
 
-    def __init__(self, settings: Settings, fmt: str, known: Mapping[str, tuple[str, ...]]) -> None:
+    def __init__(self, database: Database, fmt: str, known: Mapping[str, tuple[str, ...]]) -> None:
         """`known` are the tables and views with their columns."""
-        self.settings = settings
+        self.database = database
         self.fmt = fmt
         self.known = known
 
@@ -76,7 +78,7 @@ class Prompt:
         return "\n".join(lines)
 
     def _statements(self, text: str) -> list[Statement]:
-        return statements(text, backslashes=not self.settings.database_url.startswith("sqlite"))
+        return statements(text, backslashes=not self.database.settings.database_url.startswith("sqlite"))
 
     def _answer(self, text: str) -> None:
         command, _, argument = text.strip().partition(" ")
@@ -94,7 +96,7 @@ class Prompt:
 
     def _query(self, statement: str) -> None:
         began = time.monotonic()
-        with open_database(self.settings) as database, database.sql(statement) as rows:
+        with self.database.sql(statement) as rows:
             columns = rows.columns
             shown = list(islice(rows, MOST_ROWS))
             more = next(iter(rows), None) is not None

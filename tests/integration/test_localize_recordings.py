@@ -154,6 +154,7 @@ def test_the_same_through_the_door(room: Path, url: str) -> None:
         assert [answer.frame_index for answer in answers] == [0, 12]
         assert all(answer.localized for answer in answers)
         assert 0 < answers[0].sigma_m < 0.05
+        assert db.tables()["maps"] == ("id", "name", "created_at")
         with pytest.raises(door.SemdbError, match="every=0"):
             db.localize_recording(room, every=0)
 

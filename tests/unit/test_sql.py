@@ -147,6 +147,13 @@ def test_a_pipe_and_a_file_hold_several_statements() -> None:
     assert json.loads(run("--format", "json", piped="SELECT 'é' AS a;").stdout) == [{"a": "é"}]
 
 
+def test_what_columns_of_equal_names_are_called_is_said() -> None:
+    result = run("SELECT 1 AS a, 2 AS a", "--format", "json")
+    assert json.loads(result.stdout) == [{"a": 1, "a_2": 2}]
+    assert result.stderr == "semdb: columns of equal names are numbered: a, a_2\n"
+    assert run("SELECT 1 AS a, 2 AS a").stderr == ""
+
+
 def test_the_line_of_what_fails_is_named() -> None:
     result = run(piped="SELECT 1 AS a;\n\nSELECT nope;\nSELECT 2", code=1)
     assert result.stdout == "a\n-\n1\n\n"
