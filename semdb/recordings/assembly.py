@@ -15,6 +15,7 @@ from semdb.recordings.images import ImageHeader, inspect_file
 from semdb.recordings.intrinsics import camera_doubts, camera_problem
 from semdb.recordings.options import ReadOptions
 from semdb.recordings.registration import depth_size
+from semdb.shown import number
 from semdb.types import Camera
 
 HIGHEST_INDEX = 2**31 - 1  # that the database takes
@@ -115,7 +116,7 @@ def _recording(draft: Draft, usable: Sequence[FrameEntry], camera: Camera) -> Re
         raise no_usable_frame(draft)
     if draft.assumed_scale and any(entry.depth_path for entry in usable):
         draft.assumed.append(
-            f"depth scale: {draft.depth_scale:g} per metre ({draft.assumed_scale}); --depth-scale gives another"
+            f"depth scale: {number(draft.depth_scale)} per metre ({draft.assumed_scale}); --depth-scale gives another"
         )
     return Recording(
         path=draft.path,

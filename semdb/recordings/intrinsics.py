@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from semdb.geometry import pixels_to_normalized
+from semdb.shown import number
 from semdb.types import Camera, FloatArray
 
 SHORTEST, LONGEST = 0.2, 20.0  # focal lengths in image widths: 136 and 3 degrees of view
@@ -28,16 +29,16 @@ def camera_problem(camera: Camera) -> str | None:
     for name, focal in (("fx", camera.fx), ("fy", camera.fy)):
         if not shortest <= focal <= longest:
             return (
-                f"{name} is {focal:.6g} pixels, which no camera with images of {size} has: from {shortest:g} to "
-                f"{longest:g} make sense{_unit_hint(camera)}"
+                f"{name} is {number(focal)} pixels, which no camera with images of {size} has: from {number(shortest)} "
+                f"to {number(longest)} make sense{_unit_hint(camera)}"
             )
     if not (0 < camera.cx < camera.width - 1 and 0 < camera.cy < camera.height - 1):
         return (
-            f"the principal point ({camera.cx:.6g}, {camera.cy:.6g}) is not inside the images of {size}"
+            f"the principal point ({number(camera.cx)}, {number(camera.cy)}) is not inside the images of {size}"
             f"{_size_hint(camera)}"
         )
     share, stretch = distortion_effect(camera)
-    values = ", ".join(f"{value:g}" for value in camera.distortion)
+    values = ", ".join(map(number, camera.distortion))
     if share > FOLDED:
         return (
             f"the distortion {values} folds {share:.0%} of an image of {size} over the rest: k1, k2, p1, p2, k3 of "
@@ -56,19 +57,21 @@ def camera_doubts(camera: Camera) -> list[str]:
     doubts = []
     ratio = max(camera.fx, camera.fy) / min(camera.fx, camera.fy)
     if ratio > UNEQUAL:
-        doubts.append(f"fx {camera.fx:g} and fy {camera.fy:g} differ by {ratio - 1:.0%}: the order is fx, fy, cx, cy")
+        doubts.append(
+            f"fx {number(camera.fx)} and fy {number(camera.fy)} differ by {ratio - 1:.0%}: the order is fx, fy, cx, cy"
+        )
     off_x = abs(camera.cx - (camera.width - 1) / 2) / camera.width
     off_y = abs(camera.cy - (camera.height - 1) / 2) / camera.height
     if max(off_x, off_y) > OFF_CENTRE:
         doubts.append(
-            f"the principal point ({camera.cx:g}, {camera.cy:g}) is far from the centre of images of "
+            f"the principal point ({number(camera.cx)}, {number(camera.cy)}) is far from the centre of images of "
             f"{camera.width}x{camera.height}: are the intrinsics of this size?"
         )
     if len(camera.distortion) >= 4 and max(map(abs, camera.distortion[2:4])) > TANGENTIAL:
         p1, p2 = camera.distortion[2:4]
         doubts.append(
-            f"the distortion's p1 {p1:g} and p2 {p2:g} are larger than lenses have: the order is k1, k2, p1, p2, k3, "
-            "and the k1 to k4 of a fisheye model are something else"
+            f"the distortion's p1 {number(p1)} and p2 {number(p2)} are larger than lenses have: the order is k1, k2, "
+            "p1, p2, k3, and the k1 to k4 of a fisheye model are something else"
         )
     return doubts
 
@@ -76,10 +79,14 @@ def camera_doubts(camera: Camera) -> list[str]:
 def depth_scale_problem(scale: float) -> str | None:
     """Why no depth image has so many units per metre; None where one may."""
     if not math.isfinite(scale) or not LEAST_SCALE <= scale <= MOST_SCALE:
-        hint = f"; metres per unit {scale:g} are {1 / scale:g} units per metre" if 0 < scale <= 1 / LEAST_SCALE else ""
+        hint = (
+            f"; metres per unit {number(scale)} are {number(1 / scale)} units per metre"
+            if 0 < scale <= 1 / LEAST_SCALE
+            else ""
+        )
         return (
-            f"a depth scale of {scale:g} units per metre makes no sense (from {LEAST_SCALE:g} to {MOST_SCALE:g} do; "
-            f"millimetres are 1000){hint}"
+            f"a depth scale of {number(scale)} units per metre makes no sense (from {number(LEAST_SCALE)} to "
+            f"{number(MOST_SCALE)} do; millimetres are 1000){hint}"
         )
     return None
 
@@ -123,7 +130,7 @@ def _unit_hint(camera: Camera) -> str:
             camera.cx * camera.width,
             camera.cy * camera.height,
         )
-        return f"; divided by the image's size they would be {','.join(f'{value:g}' for value in pixels)} in pixels"
+        return f"; divided by the image's size they would be {','.join(map(number, pixels))} in pixels"
     commas = (camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion)
     if len(commas) >= 8 and all(value == int(value) for value in commas):
         return "; were these decimal commas? numbers are written with points"

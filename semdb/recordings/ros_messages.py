@@ -19,6 +19,7 @@ from semdb.recordings.images import decode_gray
 from semdb.recordings.lens import Lens
 from semdb.recordings.own_depth import as_raw
 from semdb.recordings.rvl import decode_rvl
+from semdb.shown import number
 from semdb.types import Float32Array
 
 MILLIMETRES = 1000.0
@@ -141,7 +142,9 @@ def lens_of(info: Any, *, rectified: bool) -> Lens:
     if not (np.isfinite([fx, fy, cx, cy]).all() and np.isfinite(d).all()):
         raise ValueError("has a number that is not finite")
     if fx <= 0 or fy <= 0 or not 0 < width <= LARGEST_SIDE or not 0 < height <= LARGEST_SIDE:
-        raise ValueError(f"makes no sense: {width}x{height}, fx {fx:g}, fy {fy:g} (an uncalibrated camera has zeros)")
+        raise ValueError(
+            f"makes no sense: {width}x{height}, fx {number(fx)}, fy {number(fy)} (an uncalibrated camera has zeros)"
+        )
     fx, cx = fx / binning[0], (cx - left + 0.5) / binning[0] - 0.5
     fy, cy = fy / binning[1], (cy - top + 0.5) / binning[1] - 0.5
     name = str(info.distortion_model).strip().lower()

@@ -28,6 +28,7 @@ from semdb.recordings.options import ReadOptions
 from semdb.recordings.own_depth import DepthCamera, as_raw, in_color, resized
 from semdb.recordings.poses import rigid_pose
 from semdb.recordings.rvl import decode_rvl
+from semdb.shown import number
 from semdb.types import Camera, Float32Array, FloatArray
 
 TABLES = {"Node", "Data", "Admin", "Link"}
@@ -296,7 +297,8 @@ def _checked(lens: Lens) -> Lens:
         or not (0 < lens.width < 32768 and 0 < lens.height < 32768)
     ):
         raise ValueError(
-            f"has a calibration that makes no sense: {lens.width}x{lens.height}, fx {lens.fx:g}, fy {lens.fy:g}"
+            f"has a calibration that makes no sense: {lens.width}x{lens.height}, fx {number(lens.fx)}, "
+            f"fy {number(lens.fy)}"
         )
     return lens
 

@@ -28,6 +28,7 @@ from semdb.recordings.numbered import entries_of, numbered_files
 from semdb.recordings.options import ReadOptions
 from semdb.recordings.own_depth import DepthCamera, in_color
 from semdb.recordings.poses import rigid_pose
+from semdb.shown import number
 from semdb.types import Camera, FloatArray
 
 VERSION = 4
@@ -274,7 +275,9 @@ def _read_frame(stream: BinaryIO, size: int) -> tuple[FloatArray, int, SensFrame
 def _camera_of(matrix: FloatArray, size: tuple[int, int], what: str) -> Camera:
     fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
     if not (np.isfinite([fx, fy, cx, cy]).all() and fx > 0 and fy > 0):
-        raise RecordingError(f"{what} make no sense: fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g}")
+        raise RecordingError(
+            f"{what} make no sense: fx {number(fx)}, fy {number(fy)}, cx {number(cx)}, cy {number(cy)}"
+        )
     return Camera(size[0], size[1], float(fx), float(fy), float(cx), float(cy))
 
 

@@ -15,6 +15,7 @@ from semdb.perception.detectors.torchvision import FORMAT
 from semdb.perception.mask_rcnn import Architecture
 from semdb.perception.torch_models import choose_device, import_torch, layer_precision, read_checkpoint
 from semdb.settings import Settings
+from semdb.shown import number
 from semdb.training.coco import CocoData, load_coco
 from semdb.training.options import TrainOptions
 from semdb.training.samples import Sample, batches, epoch_order
@@ -161,8 +162,8 @@ def _learn(run: _Run, group: Sequence[Sample], optimizer: Any, scaler: Any, rate
     value, *parts = torch.stack([loss.detach(), *(losses[name].detach() for name in LOSSES)]).tolist()
     if not math.isfinite(value):
         raise TrainingError(
-            f"the loss is {value} at step {run.step + 1}: the learning rate ({rate:g}) is too high, or the data have "
-            "boxes that are none; the checkpoint of the last epoch is kept"
+            f"the loss is {value} at step {run.step + 1}: the learning rate ({number(rate)}) is too high, or the data "
+            "have boxes that are none; the checkpoint of the last epoch is kept"
         )
     optimizer.zero_grad(set_to_none=True)
     scaler.scale(loss).backward()
@@ -273,7 +274,7 @@ class _Curves:
         self._file.close()
 
     def write(self, step: int, epoch: int, stage: Stage, rate: float, losses: dict[str, float]) -> None:
-        values = [f"{losses[name]:.6g}" for name in ("loss", *LOSSES)]
+        values = [number(losses[name]) for name in ("loss", *LOSSES)]
         seconds = f"{time.perf_counter() - self._started:.2f}"
-        self._writer.writerow([step, epoch, stage.name, f"{rate:.6g}", *values, seconds])
+        self._writer.writerow([step, epoch, stage.name, number(rate), *values, seconds])
         self._file.flush()

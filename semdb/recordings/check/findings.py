@@ -20,6 +20,7 @@ from semdb.recordings.check.readings import AS_USUAL, Reading, readings, reread
 from semdb.recordings.check.registration import Misplaced, misplaced
 from semdb.recordings.options import option_of
 from semdb.recordings.own_depth import resized
+from semdb.shown import number
 from semdb.types import Camera, FloatArray, Int64Array
 
 LEAST_PAIRS = 3  # that tell anything at all
@@ -246,16 +247,16 @@ def _scale_finding(observed: Observed, factor: float, certain: bool, text: str, 
     inside = ROOM_M[0] <= median_depth * factor <= ROOM_M[1]
     if not inside and ROOM_M[0] <= median_depth <= ROOM_M[1]:
         value = _snapped(observed.scale / factor, (1.0, 0.01, 0.001, 0.0254, 0.3048))
-        option = f"--scale {value:g}" if "scale" in observed.takes else ""
-        return Finding("scale", certain, value, option, f"a unit of the poses is {value:g} m: {text}")
+        option = f"--scale {number(value)}" if "scale" in observed.takes else ""
+        return Finding("scale", certain, value, option, f"a unit of the poses is {number(value)} m: {text}")
     value = _snapped(observed.depth_scale / factor, USUAL_SCALES)
-    option = f"--depth-scale {value:g}" if "depth_scale" in observed.takes else ""
+    option = f"--depth-scale {number(value)}" if "depth_scale" in observed.takes else ""
     return Finding(
         "depth_scale",
         certain,
         value,
         option,
-        f"depth has {value:g} units a metre, not {observed.depth_scale:g}: {text}",
+        f"depth has {number(value)} units a metre, not {number(observed.depth_scale)}: {text}",
     )
 
 
