@@ -12,6 +12,7 @@ from semdb.database.records import Deleted, RecordingStatus
 from semdb.errors import DatabaseUnavailableError, SemdbError, UsageError
 
 if TYPE_CHECKING:  # the rooms behind are entered when something is asked of them: they take a second to import
+    from semdb.database.copying import Copied
     from semdb.door.protocol import Source
     from semdb.evaluation.runner import EvaluateOptions, Outcome
     from semdb.ingestion.queue import Send
@@ -189,6 +190,37 @@ class Writing(Reading):
         from semdb.evaluation.runner import evaluate_each
 
         return evaluate_each(paths, self.settings, options, progress=progress, say=self._say)
+
+    def export(
+        self,
+        format: str,
+        map: str,
+        out: PathText,
+        *,
+        voxel_m: float = 0.02,
+        max_depth_m: float = 8.0,
+        progress: Progress | None = None,
+    ) -> str:
+        """Writes a map as other programs read it, or whole (`semdb`); returns a line about what was written.
+
+        `format` is tum, colmap, kapture, ply, mcap or semdb; `out` a file or folder that is not there. `voxel_m` and
+        `max_depth_m` thin and bound a cloud. Raises UsageError, NotFoundError, DatabaseError.
+        """
+        from semdb.exchange.formats import export_map
+        from semdb.exchange.source import ExportOptions
+
+        options = ExportOptions(voxel_m=voxel_m, max_depth_m=max_depth_m)
+        return export_map(self._store(), format, map, Path(out), options, progress)
+
+    def import_map(self, folder: PathText, *, map: str | None = None, progress: Progress | None = None) -> Copied:
+        """Adds a map that `export` wrote whole, under its own name or that of `map`; cut off and run again it goes on.
+
+        Raises RecordingError for a folder that is none or is damaged, UsageError where another map
+        has the name, SchemaError, DatabaseError.
+        """
+        from semdb.exchange.whole import import_whole
+
+        return import_whole(Path(folder), self._store(create=True), map, progress)
 
     def init(self) -> SchemaChange:
         """Creates or upgrades the schema; nothing happens when it is there. Raises SchemaError, DatabaseError."""

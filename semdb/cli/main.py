@@ -34,6 +34,8 @@ COMMANDS: dict[str, str] = {
     "localize": "semdb.cli.localize",
     "evaluate": "semdb.cli.evaluate",
     "show": "semdb.cli.show",
+    "export": "semdb.cli.export",
+    "import": "semdb.cli.export:import_command",
     "sql": "semdb.cli.sql",
     "keypoints": "semdb.cli.keypoints",
     "models": "semdb.cli.models",

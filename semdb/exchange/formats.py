@@ -1,0 +1,49 @@
+"""The formats that maps are exported in, by name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import cast
+
+from semdb.database.store import Store
+from semdb.errors import UsageError
+from semdb.exchange.source import Exporter, ExportOptions, MapSource, Progress
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """`where` is ``module:function`` of its `Exporter`; `about` says for people what it writes."""
+
+    where: str
+    about: str
+
+
+FORMATS = {
+    "tum": Format("semdb.exchange.tum:write_tum", "trajectory of the keyframes, for evo and others (a file)"),
+    "colmap": Format("semdb.exchange.colmap:write_colmap", "text model with images, points and tracks (a folder)"),
+    "kapture": Format("semdb.exchange.kapture:write_kapture", "sensors, trajectories, images, depth (a folder)"),
+    "ply": Format("semdb.exchange.ply:write_ply", "coloured cloud of the keyframes' depth (a file)"),
+    "mcap": Format("semdb.exchange.mcap:write_mcap", "images, cameras and poses for Foxglove and ROS 2 (a file)"),
+    "semdb": Format("semdb.exchange.whole:write_whole", "the whole map, for `semdb import` (a folder)"),
+}
+
+
+def export_map(
+    store: Store,
+    name: str,
+    map_name: str,
+    out: Path,
+    options: ExportOptions | None = None,
+    progress: Progress | None = None,
+) -> str:
+    """Writes a map in a format; returns a line about what was written.
+
+    Raises UsageError for a format that is none, or where something is at `out` already; NotFoundError for the map.
+    """
+    if name not in FORMATS:
+        raise UsageError(f"there is no format {name!r}; there are {', '.join(FORMATS)}")
+    module, function = FORMATS[name].where.split(":")
+    write = cast(Exporter, getattr(import_module(module), function))
+    return write(MapSource.of(store, map_name, progress), out, options or ExportOptions())

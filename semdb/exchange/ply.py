@@ -1,0 +1,93 @@
+"""A coloured cloud of the keyframes' depth, thinned by voxels, as binary PLY: a voxel keeps the first point in it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from semdb.errors import FrameError, UsageError
+from semdb.exchange.source import ExportOptions, MapSource, decoded, new_file
+from semdb.geometry import back_project, transform_points
+from semdb.types import Camera, Float32Array, FloatArray, ImageArray
+
+VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
+COUNT_DIGITS = 12  # of the number of points, which is known at the end only
+
+
+def write_ply(source: MapSource, out: Path, options: ExportOptions) -> str:
+    """Points of all keyframes that have depth. What is in memory are the voxels that have a point, 8 bytes each.
+
+    Raises UsageError where no keyframe has depth.
+    """
+    if options.voxel_m <= 0:
+        raise UsageError(f"--voxel must be positive, but is {options.voxel_m:g}")
+    seen = np.empty(0, np.uint64)
+    count = without = 0
+    with new_file(out).open("wb") as file:
+        file.write(_header(0, source.name))
+        for done, head in enumerate(source.heads, 1):
+            try:
+                image, depth = decoded(source.image(head.id), head)
+            except FrameError:
+                depth = None
+            if depth is None:
+                without += 1
+            else:
+                points, colours = cloud(image, depth, head.camera, head.world_from_camera, options)
+                keys = voxels(points, options.voxel_m)
+                keys, first = np.unique(keys, return_index=True)
+                new = ~np.isin(keys, seen, assume_unique=True)
+                chosen = np.sort(first[new])
+                seen = np.union1d(seen, keys[new])
+                rows = np.empty(len(chosen), VERTEX)
+                for axis, name in enumerate("xyz"):
+                    rows[name] = points[chosen, axis]
+                for channel, name in enumerate(("red", "green", "blue")):
+                    rows[name] = colours[chosen, channel]
+                file.write(rows.tobytes())
+                count += len(chosen)
+            source.tell("exporting", done)
+        file.seek(0)
+        file.write(_header(count, source.name))
+    if not count:
+        out.unlink()
+        raise UsageError(f"no keyframe of the map {source.name!r} has depth: there are no points to export")
+    note = f", {without} keyframes without depth" if without else ""
+    return f"{count} points, one in {options.voxel_m * 100:g} cm{note}"
+
+
+def cloud(
+    image: ImageArray, depth: Float32Array, camera: Camera, world_from_camera: FloatArray, options: ExportOptions
+) -> tuple[FloatArray, npt.NDArray[np.uint8]]:
+    """World points ``[n, 3]`` and colours ``[n, 3]`` of every `stride`-th pixel with depth within reach."""
+    half = options.stride // 2
+    rows, columns = np.mgrid[half : camera.height : options.stride, half : camera.width : options.stride]
+    z = depth[rows, columns]
+    with np.errstate(invalid="ignore"):
+        known = (z > 0) & (z <= options.max_depth_m)
+    pixels = np.column_stack([columns[known], rows[known]])
+    points = back_project(camera, pixels, z[known])
+    good = np.isfinite(points).all(axis=1)
+    return transform_points(world_from_camera, points[good]), image[pixels[good, 1], pixels[good, 0]]
+
+
+def voxels(points: FloatArray, size: float) -> npt.NDArray[np.uint64]:
+    """A number ``[n]`` for the voxel of each point, 21 bits an axis."""
+    cells = np.floor(points / size).astype(np.int64) + (1 << 20)
+    cells = np.clip(cells, 0, (1 << 21) - 1).astype(np.uint64)
+    return np.asarray((cells[:, 0] << np.uint64(42)) | (cells[:, 1] << np.uint64(21)) | cells[:, 2])
+
+
+def _header(count: int, name: str) -> bytes:
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment semdb map {name.encode('ascii', 'backslashreplace').decode()[:200]}, metres".replace("\n", " "),
+        f"element vertex {count:0{COUNT_DIGITS}d}",
+        *(f"property float {axis}" for axis in "xyz"),
+        *(f"property uchar {channel}" for channel in ("red", "green", "blue")),
+        "end_header\n",
+    ]
+    return "\n".join(lines).encode()
