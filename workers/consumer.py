@@ -14,21 +14,40 @@ from celery.worker.consumer import Consumer
 
 from semdb.events import event
 
-from . import metrics
+from . import again, metrics
 
 LONGEST = 200  # characters of a line about what anybody may have sent
+FOLLOWERS = ("callbacks", "errbacks", "chain")
+_TEXTS = ("task", "id", "lang", "eta", "expires", "root_id", "parent_id", "group", "origin", "argsrepr", "kwargsrepr")
+_HEADERS: dict[str, tuple[type, ...]] = {**dict.fromkeys(_TEXTS, (str,)), "redelivered": (bool,)}
+_COUNTS = ("retries", again.FAILURES, again.LOSSES)
 
 
 def _tidy(headers: Any) -> None:
-    """Takes out of `headers` what a sender has no say in, and what would stop Celery half-way. Raises ValueError."""
+    """Leaves in `headers` what is needed, in the form that Celery gives it: the rest may stop it half-way.
+
+    Limits of time are those of the task; a sender has no say in them. Raises ValueError without the names.
+    """
     if not isinstance(headers, dict):
         raise ValueError("it is no message of Celery")
-    if not isinstance(headers.get("id", ""), str) or not isinstance(headers.get("task", ""), str):
+    if not all(isinstance(headers.get(name, ""), str) for name in ("task", "id")):
         raise ValueError("task and id are texts")
-    headers["timelimit"] = [None, None]  # those of the task
-    retries = headers.get("retries")
-    if not isinstance(retries, int) or not 0 <= retries < 2**31:
-        headers["retries"] = 0
+    kept = {name: headers[name] for name, kinds in _HEADERS.items() if isinstance(headers.get(name), kinds)}
+    for name in _COUNTS:
+        value = headers.get(name)
+        kept[name] = value if type(value) is int and 0 <= value < 2**31 else 0
+    headers.clear()
+    headers.update(kept, timelimit=[None, None])
+
+
+def _check(body: Any) -> None:
+    """Raises ValueError for a body that is no arguments: a list of them, names with values, and what follows."""
+    fits = isinstance(body, list | tuple) and len(body) == 3
+    fits = fits and isinstance(body[0], list) and isinstance(body[1], dict) and isinstance(body[2], dict | None)
+    if fits and body[2]:
+        fits = all(value is None or isinstance(value, list) for value in map(body[2].get, FOLLOWERS))
+    if not fits:
+        raise ValueError("its body is not arguments, names with values, and what follows")
 
 
 class CarefulConsumer(Consumer):  # type: ignore[misc]
@@ -41,6 +60,7 @@ class CarefulConsumer(Consumer):  # type: ignore[misc]
         def careful(message: Any) -> Any:
             try:
                 _tidy(message.headers)
+                _check(message.payload)
                 return handle(message)
             except (*self.connection_errors, MemoryError):
                 raise

@@ -160,7 +160,7 @@ def test_where_a_recording_is_says_the_database_and_not_the_message(
         Workplace(elsewhere).do(*outbox[-1])
 
 
-def push(port: int, body: Any, headers: dict[str, Any], content_type: str = "application/json") -> None:
+def push(port: int, body: Any, headers: Any, content_type: str = "application/json") -> None:
     """Puts a message into the queue of the broker as anybody who reaches it can, past Celery."""
     text = body if isinstance(body, bytes) else json.dumps(body).encode()
     message = {
@@ -169,7 +169,7 @@ def push(port: int, body: Any, headers: dict[str, Any], content_type: str = "app
         "content-type": content_type,
         "headers": headers,
         "properties": {
-            "body_encoding": "base64", "correlation_id": headers.get("id"), "delivery_mode": 2, "priority": 0,
+            "body_encoding": "base64", "correlation_id": "c", "delivery_mode": 2, "priority": 0,
             "delivery_tag": f"tag-{time.monotonic_ns()}", "delivery_info": {"exchange": "", "routing_key": "semdb"},
         },
     }  # fmt: skip
@@ -217,6 +217,8 @@ def test_a_worker_among_poisoned_messages_does_its_work(room: Path, tmp_path: Pa
             (b"[" * 100_000, {**own, "id": "deep"}),
             (b"no json", {**own, "id": "text"}),
             ({"no": "arguments"}, {**own, "id": "shape"}),
+            ([[], 5, {}], {**own, "id": "no names"}),
+            ([[], {}, {"chain": 5}], {**own, "id": "no chain"}),
             ([1, 2, 3, 4], {**own, "id": "numbers"}),
             ([[], {}, {}], {**own, "id": "unknown", "task": "os.system"}),
             ([[], {}, {}], {**own, "id": "list", "task": [ITEMS_TASK]}),
@@ -230,8 +232,9 @@ def test_a_worker_among_poisoned_messages_does_its_work(room: Path, tmp_path: Pa
         pickled = b"\x80\x04\x8c\x05posix\x94."
         push(broker.port, pickled, {**own, "id": "pickle"}, "application/x-python-serialize")
         push(broker.port, [[], {}, {}], {**own, "id": "limit", "timelimit": "soon", "retries": "many"})
-        push(broker.port, [[], {}, {"chain": 5, "callbacks": "x"}], {**own, "id": "chained"})
-        push(broker.port, [[77, "x", [1]], {}, {}], {**own, "id": "counted", "semdb_failures": "many"})
+        odd = ("semdb_failures", "root_id", "group", "stamped_headers", "stamps", "shadow", "origin", "chord")
+        for name in odd:
+            push(broker.port, [[77, "x", [1]], {}, {}], {**own, "id": f"odd {name}", name: [["x"]]})
         sender.send_task(ITEMS_TASK, args=[77, "x", [1]])  # of a recording that is not there
         sender.send_task(INGEST_TASK, args=[str(good), "m", None, {"stride": 4}])
         started = time.monotonic()
@@ -240,8 +243,8 @@ def test_a_worker_among_poisoned_messages_does_its_work(room: Path, tmp_path: Pa
             services.wait_until(lambda: stored(store) == 6 and is_complete(store), "the good recording is stored", 60)
             seconds = time.monotonic() - started
             text = worker.text()
-            assert text.count("given_up") == len(refused) + len(nothing) + 3, text
-            assert text.count("dropped recording=77") == 2
+            assert text.count("given_up") == len(refused) + len(nothing) + 2, text
+            assert text.count("dropped recording=77") == len(odd) + 1
             assert "Traceback" not in text
             assert "\x1b[31m" not in text
             services.wait_until(lambda: redis(broker.port, "LLEN", "semdb") == b":0\r\n", "no message is left")
