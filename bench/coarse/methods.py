@@ -57,7 +57,7 @@ class NaiveSql:
                 return []
             rows = sorted(connection.execute(self.vectors, {"ids": ids}).tuples())
         found = np.array([row[0] for row in rows])
-        vectors = decode_vectors([row[1] for row in rows], "cnn_vectors of keyframe", found)
+        vectors = decode_vectors([row[1] for row in rows], found)
         cosines = vectors.astype(np.float64) @ query.vector.astype(np.float64)
         return [int(i) for i in found[np.lexsort((found, -cosines))][:FIRST]]
 

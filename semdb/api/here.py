@@ -49,7 +49,7 @@ class Here:
         with self._turn:
             self.check_open()
             if self._store is None:
-                self._store = open_store(self.settings.database_url, create=create, say=None if create else self.say)
+                self._store = open_store(self.settings.database_url, create=create, say=self.say)
             return self._store
 
     def maps(self) -> OpenMaps:

@@ -227,7 +227,7 @@ class Localizing(Base):
                 continue
             decode_ms = (time.perf_counter() - started) * 1000
             maps = open_maps.asked(map, coarse) if number else maps  # as they are now
-            found = ask(maps, query)
+            found = ask(maps, query, self._say)
             timing = {"decode": decode_ms, **found.description.timing_ms, **found.localization.timing_ms}
             timing["total"] = (time.perf_counter() - started) * 1000
             found = replace(found, localization=replace(found.localization, timing_ms=timing))

@@ -82,8 +82,12 @@ class Reading(Base):
             return [keyframe_of(head, content) for head in store.keyframe_heads_of(sorted({int(key) for key in ids}))]
         map_id = self._head(str(map)).id
         recording_id = None if recording is None else store.find_recording(map_id, recording)
-        heads = store.keyframe_heads(map_id, recording_id, after=after, limit=limit)
+        heads = store.keyframe_heads(map_id, recording_id, after=after, limit=limit, bad=store.left_out)
         return [keyframe_of(head, content) for head in heads]
+
+    def check_keyframes(self, ids: Iterable[int]) -> None:
+        """Raises NotFoundError, naming it, for a keyframe that is not there; damaged ones are."""
+        self._store().check_keyframes([int(key) for key in ids])
 
     def sql(self, statement: str) -> Rows:
         """The rows of one read-only statement, fetched while they are iterated over.

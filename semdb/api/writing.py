@@ -172,7 +172,7 @@ class Writing(Reading):
             if map is not None or recording is not None:
                 raise UsageError("delete either keyframes or a recording or a map")
             wanted = sorted({int(key) for key in keyframes})
-            self.keyframes(ids=wanted)  # says which one does not exist
+            store.check_keyframes(wanted)
             return Deleted(0, store.delete_keyframes(wanted, progress))
         if recording is not None:
             return store.delete_recording(self.recording(recording, map).recording_id, progress)

@@ -84,7 +84,7 @@ def delete_keyframes(
 
     with open_database(overrides.settings()) as database:
         wanted = sorted(set(keyframes))
-        database.keyframes(ids=wanted)  # says which one does not exist
+        database.check_keyframes(wanted)
         confirm(f"Delete {len(wanted)} keyframes?", yes)
         with Progress("deleting", "keyframes") as progress:
             deleted = database.delete(keyframes=wanted, progress=progress.update)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from sqlalchemy import Engine, func, select
 
-from semdb.database import retry
+from semdb.database import checked, retry
+from semdb.database.exact_sums import exact_sum, whole
 from semdb.database.records import Change, ChangeKind, ChangeMark
 from semdb.database.tables import keyframe_changes
-from semdb.errors import DatabaseError
 
 
 def changes_since(engine: Engine, map_id: int, change_id: int) -> list[Change]:
@@ -18,12 +18,21 @@ def changes_since(engine: Engine, map_id: int, change_id: int) -> list[Change]:
     c = keyframe_changes.c
     query = select(c.id, c.keyframe_id, c.kind).where(c.map_id == map_id, c.id > change_id).order_by(c.id)
     rows = retry.read(engine, lambda connection: list(connection.execute(query)))
-    try:
-        return [Change(row.id, row.keyframe_id, ChangeKind(row.kind)) for row in rows]
-    except ValueError as error:
-        raise DatabaseError(
-            f"the change log holds a kind that this semdb does not know ({error}): upgrade it"
-        ) from error
+    return [
+        Change(
+            row.id,
+            checked.integer(row.keyframe_id, f"keyframe_changes.keyframe_id of change {row.id}", -(2**63), 2**63 - 1),
+            checked.choice(row.kind, f"keyframe_changes.kind of change {row.id}", ChangeKind),
+        )
+        for row in rows
+    ]
+
+
+def change_ids_since(engine: Engine, map_id: int, change_id: int) -> list[int]:
+    """Ids of the changes of a map above `change_id`, ascending."""
+    c = keyframe_changes.c
+    query = select(c.id).where(c.map_id == map_id, c.id > change_id).order_by(c.id)
+    return retry.read(engine, lambda connection: list(connection.execute(query).scalars()))
 
 
 def change_mark(engine: Engine, map_id: int, change_id: int) -> ChangeMark:
@@ -32,10 +41,10 @@ def change_mark(engine: Engine, map_id: int, change_id: int) -> ChangeMark:
     It reads the index alone, as many entries as there are changes.
     """
     c = keyframe_changes.c
-    query = select(func.coalesce(func.max(c.id), 0), func.count(), func.coalesce(func.sum(c.id), 0))
+    query = select(func.coalesce(func.max(c.id), 0), func.count(), *exact_sum(engine, c.id))
     query = query.where(c.map_id == map_id, c.id > change_id)
-    newest, rows, total = retry.read(engine, lambda connection: connection.execute(query).one())
-    return ChangeMark(int(newest), int(rows), int(total))
+    newest, rows, *total = retry.read(engine, lambda connection: connection.execute(query).one())
+    return ChangeMark(int(newest), int(rows), whole(total))
 
 
 def change_text(engine: Engine, map_id: int, change_id: int) -> str | None:

@@ -6,12 +6,15 @@ The score is that of `semdb.class_score`. What is here is the reference that an 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from decimal import Decimal
+from typing import Any
 
 from sqlalchemy import BigInteger, Connection, Engine, func, literal, literal_column, select
 from sqlalchemy.sql.elements import ColumnElement
 
 from semdb.class_score import SCALE, ClassQuery, ClassTerm, Part, class_query
 from semdb.database import retry
+from semdb.database.checked import LARGEST
 from semdb.database.records import ScoredKeyframe
 from semdb.database.tables import categories, keyframe_categories, keyframes, recordings
 
@@ -79,7 +82,8 @@ def class_filter(
         keyframe_id, points = _scores(map_id, query, known)
         statement = select(keyframe_id, points).where(points >= query.least(minimum_share))
         statement = statement.order_by(points.desc(), keyframe_id).limit(at_most)
-        return [ScoredKeyframe(row[0], int(row[1]) / query.whole) for row in connection.execute(statement)]
+        rows = connection.execute(statement)
+        return [ScoredKeyframe(row[0], int(row[1]) / query.whole) for row in rows if _is_score(row[1], query)]
 
     return retry.read(engine, work)
 
@@ -94,10 +98,15 @@ def class_scores(engine: Engine, map_id: int, query: ClassQuery, keyframe_ids: S
         for start in range(0, len(keys) if known else 0, CHUNK):
             keyframe_id, points = _scores(map_id, query, known, keys[start : start + CHUNK])
             rows = connection.execute(select(keyframe_id, points).where(points > 0))
-            found.update((row[0], int(row[1]) / query.whole) for row in rows)
+            found.update((row[0], int(row[1]) / query.whole) for row in rows if _is_score(row[1], query))
         return found
 
     return retry.read(engine, work)
+
+
+def _is_score(points: Any, query: ClassQuery) -> bool:
+    """Not of a keyframe whose strength, which SQLite may have as anything, divides by nothing."""
+    return isinstance(points, int | float | Decimal) and 0 <= points <= query.whole
 
 
 def _known(connection: Connection, query: ClassQuery) -> list[tuple[int, ClassTerm]]:
@@ -149,7 +158,9 @@ def _contribution(known: list[tuple[int, ClassTerm]]) -> ColumnElement[int]:
     of_category: dict[int, list[str]] = {}
     for category_id, term in known:
         value, enough = _COLUMNS[term.part], -(-term.full // term.per_object)
-        added = f"CASE WHEN {value} >= {enough:d} THEN {term.full:d} ELSE {term.per_object:d} * {value} END"
+        # what is no number of objects, on SQLite, is in no range
+        added = f"CASE WHEN {value} BETWEEN {enough:d} AND {LARGEST:d} THEN {term.full:d} "
+        added += f"WHEN {value} BETWEEN 1 AND {enough:d} THEN {term.per_object:d} * {value} ELSE 0 END"
         of_category.setdefault(int(category_id), []).append(added)
     branches = " ".join(f"WHEN {key:d} THEN {' + '.join(added)}" for key, added in of_category.items())
     return literal_column(f"CASE keyframe_categories.category_id {branches} ELSE 0 END", BigInteger)

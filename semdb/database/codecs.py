@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,9 +20,11 @@ import numpy as np
 import numpy.typing as npt
 from isal.isal_zlib import crc32
 
+from semdb.database.checked import MOST_PIXELS
+from semdb.database.checked import blob as checked_blob
 from semdb.database.compact import compact, expand
 from semdb.errors import CodecError
-from semdb.types import BoolArray, Features, Float32Array, IntArray, Keypoints
+from semdb.types import BoolArray, Features, Float32Array, Int64Array, IntArray, Keypoints
 
 ARRAY_MAGIC = b"SDBA"
 MASK_MAGIC = b"SDBM"
@@ -79,30 +82,81 @@ def decode_array(blob: bytes, where: str, *, magic: bytes = ARRAY_MAGIC) -> npt.
     view = memoryview(blob)
     if crc32(view[_HEADER.size :], crc32(view[:_CHECKED])) != checksum:
         raise CodecError(f"{where}: the blob's checksum is wrong; delete the recording and ingest it again")
-    return np.frombuffer(blob, dtype=dtype, offset=start).reshape(shape)
+    try:
+        return np.frombuffer(blob, dtype=dtype, offset=start).reshape(shape)
+    except ValueError:  # nothing, in more dimensions than there is memory
+        raise CodecError(f"{where}: no array has the shape {shape}") from None
 
 
-def decode_vectors(blobs: Sequence[bytes], where: str, keys: npt.NDArray[np.int64]) -> Float32Array:
-    """Vectors float32 ``[n, d]`` of many blobs (``[0, 0]`` for none), each checked as by `decode_array`.
+def decode_vectors(
+    blobs: Sequence[Any],
+    keys: Int64Array,
+    size: int | None = None,
+    bad: Callable[[int, CodecError], None] | None = None,
+) -> Float32Array:
+    """CNN vectors float32 ``[n, d]`` of many blobs (``[0, 0]`` for none) of the keyframes `keys` ``[n]``.
 
-    `where` and the key of a blob name its row. Raises CodecError, also for one of another length than the first.
+    Each is checked as by `decode_array`, is normalised, and has `size` numbers, or as many as most have. One that is
+    not is a row of zeros, unlike every other, and told to `bad`; without it, or where none is right, CodecError.
     """
     if not len(blobs):
-        return np.empty((0, 0), np.float32)
-    first = decode_array(blobs[0], f"{where} {keys[0]}")
-    if first.ndim != 1 or first.dtype != np.dtype("<f4"):
-        raise CodecError(f"{where} {keys[0]}: {first.dtype} {first.shape} is not a vector")
-    start = _HEADER.size + 4
-    head, tail, size = blobs[0][:_CHECKED], blobs[0][_HEADER.size : start], len(blobs[0])
-    seed = crc32(head)
-    for key, blob in zip(keys, blobs, strict=True):
+        return np.empty((0, size or 0), np.float32)
+    joined = _equal_vectors(blobs)
+    if joined is not None and size in (None, joined.shape[1]) and (np.abs(joined) <= _MOST_OF_UNIT).all():
+        return joined
+    found = [_vector(blob, int(key)) for blob, key in zip(blobs, keys, strict=True)]
+    sizes = Counter(len(vector) for vector in found if not isinstance(vector, CodecError))
+    if size is None and sizes:
+        size = max(sizes, key=lambda length: (sizes[length], length))
+    matrix = np.zeros((len(blobs), size or 0), np.float32)
+    for row, vector in enumerate(found):
+        if isinstance(vector, CodecError):
+            error = vector
+        elif len(vector) == size:
+            matrix[row] = vector
+            continue
+        else:
+            error = CodecError(f"{_VECTOR} {keys[row]} has {len(vector)} numbers, and others have {size}")
+        if bad is None or size is None:
+            raise error
+        bad(int(keys[row]), error)
+    return matrix
+
+
+_VECTOR = "cnn_vectors.vector of keyframe"
+_MOST_OF_UNIT = 1.01  # a number of a vector of length one
+
+
+def _equal_vectors(blobs: Sequence[Any]) -> Float32Array | None:
+    """Vectors ``[n, d]`` of blobs that all begin alike and are whole; None of others."""
+    head, start, size = blobs[0][:_CHECKED], _HEADER.size + 4, len(blobs[0])
+    if any(not isinstance(blob, bytes) for blob in blobs) or size <= start or (size - start) % 4:
+        return None
+    first = _HEADER.pack(ARRAY_MAGIC, 1, _CODES[np.dtype("<f4")], 1, 0, 0)[:_CHECKED]
+    tail, seed = struct.pack("<I", (size - start) // 4), crc32(head)
+    if head != first or blobs[0][_HEADER.size : start] != tail:
+        return None
+    for blob in blobs:
         if len(blob) != size or blob[:_CHECKED] != head or blob[_HEADER.size : start] != tail:
-            other = decode_array(blob, f"{where} {key}")
-            raise CodecError(f"{where} {key}: {other.dtype} {other.shape} is not a vector as others, {first.shape}")
+            return None
         if crc32(memoryview(blob)[_HEADER.size :], seed) != int.from_bytes(blob[_CHECKED : _HEADER.size], "little"):
-            decode_array(blob, f"{where} {key}")  # says what is wrong
+            return None
     joined = np.frombuffer(b"".join(blobs), np.uint8).reshape(len(blobs), size)
     return np.ascontiguousarray(joined[:, start:]).view("<f4").astype(np.float32, copy=False)
+
+
+def _vector(blob: Any, key: int) -> Float32Array | CodecError:
+    """One vector ``[d]``, or what is wrong with it."""
+    where = f"{_VECTOR} {key}"
+    try:
+        found = decode_array(checked_blob(blob, where), where)
+    except CodecError as error:
+        return error
+    if found.ndim != 1 or found.dtype != np.dtype("<f4") or not len(found):
+        return CodecError(f"{where}: {found.dtype} {list(found.shape)} is not a vector")
+    if not (np.abs(found) <= _MOST_OF_UNIT).all():
+        return CodecError(f"{where} has numbers that no vector of length 1 has")
+    return np.asarray(found, np.float32)
 
 
 def encode_mask(mask: BoolArray) -> bytes:
@@ -117,12 +171,16 @@ def encode_mask(mask: BoolArray) -> bytes:
     return encode_array(np.concatenate([mask.shape, run_lengths(mask, LONGEST_RUN)]).astype("<u2"), magic=MASK_MAGIC)
 
 
-def decode_mask(blob: bytes, where: str) -> BoolArray:
-    """The mask ``[H, W]`` of a blob. Raises CodecError."""
+def decode_mask(blob: bytes, where: str, size: tuple[int, int] | None = None) -> BoolArray:
+    """The mask ``[H, W]`` of a blob. Raises CodecError, also for one of another `size` (H, W), which is not made."""
     numbers = decode_array(blob, where, magic=MASK_MAGIC)
     if numbers.ndim != 1 or len(numbers) < 2 or numbers.dtype not in (np.dtype("<u2"), np.dtype("<u4")):
         raise CodecError(f"{where}: the mask has no size")
     height, width = int(numbers[0]), int(numbers[1])
+    if size is not None and (height, width) != size:
+        raise CodecError(f"{where}: a mask of {width}x{height} pixels, but the camera has {size[1]}x{size[0]}")
+    if height * width > MOST_PIXELS:
+        raise CodecError(f"{where}: a mask of {width}x{height} pixels is larger than any image that semdb reads")
     runs = numbers[2:].astype(np.int64)
     if int(runs.sum()) != height * width:
         raise CodecError(f"{where}: the mask's runs do not fill {width}x{height} pixels")
@@ -149,7 +207,8 @@ def encode_keypoints(keypoints: Keypoints, *, small: bool = False) -> bytes:
 def keypoint_rows(blob: bytes, where: str) -> Float32Array:
     """The rows float32 ``[n, 9]`` (`KEYPOINT_COLUMNS`) of keypoints of either kind. Raises CodecError."""
     if blob[:4] == COMPACT_MAGIC:
-        expanded = expand(decode_array(blob, where, magic=COMPACT_MAGIC))
+        with np.errstate(all="ignore"):  # what is no number is found by whoever looks at the values
+            expanded = expand(decode_array(blob, where, magic=COMPACT_MAGIC))
         if expanded is None:
             raise CodecError(f"{where}: compact keypoints are uint16 [26 + 8 n]; these are not")
         return expanded

@@ -113,6 +113,7 @@ def _sqlite_engine(url: URL) -> Engine:
     @event.listens_for(engine, "connect")
     def _configure(connection: sqlite_file.FileConnection, _record: Any) -> None:
         nonlocal opened
+        connection.text_factory = _as_text
         connection.execute(f"PRAGMA busy_timeout = {BUSY_TIMEOUT_MS}")
         connection.execute("PRAGMA foreign_keys = ON")
         if connection.opening in (sqlite_file.Opening.CREATE, sqlite_file.Opening.WRITE):
@@ -134,6 +135,11 @@ def _sqlite_engine(url: URL) -> Engine:
         connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
 
     return engine
+
+
+def _as_text(data: bytes) -> str:
+    """Text of a column; what is no UTF-8 is found, and told, where the value is looked at."""
+    return data.decode("utf-8", "surrogateescape")
 
 
 def make_server_engine(url: URL, read_timeout_s: int | None = None) -> Engine:

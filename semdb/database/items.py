@@ -32,7 +32,7 @@ from sqlalchemy import (
     update,
 )
 
-from semdb.database import retry
+from semdb.database import checked, retry
 from semdb.database.clock import now_plus
 from semdb.database.records import ItemState, RecordingState
 from semdb.database.tables import ingest_items, recordings
@@ -109,9 +109,17 @@ def claim(
             return []
         these = {"of_recording": recording_id, "of_frames": indexes, "of_worker": worker}
         connection.execute(take, these)
-        return [Claim(int(row.frame_index), int(row.attempts)) for row in connection.execute(mine, these)]
+        return [_claim(recording_id, row) for row in connection.execute(mine, these)]
 
     return retry.write(engine, work)
+
+
+def _claim(recording_id: int, row: Any) -> Claim:
+    where = f"of frame {checked.shown(row.frame_index)} of recording {recording_id}"
+    return Claim(
+        checked.integer(row.frame_index, f"ingest_items.frame_index {where}"),
+        checked.integer(row.attempts, f"ingest_items.attempts {where}"),
+    )
 
 
 @lru_cache(maxsize=16)
@@ -171,7 +179,7 @@ def release_dead(engine: Engine, recording_id: int | None = None) -> int:
         running = and_(running, _item.recording_id == recording_id)
     query = select(_item.worker).where(running, _item.worker.is_not(None)).distinct()
     names = retry.read(engine, lambda c: list(c.execute(query).scalars()))
-    gone = [name for name in names if worker_is_gone(name)]
+    gone = [name for name in names if isinstance(name, str) and worker_is_gone(name)]
     if not gone:
         return 0
 
@@ -220,7 +228,8 @@ def open_items(engine: Engine, recording_id: int, frames: Sequence[int]) -> list
         .order_by(_item.frame_index)
     )
     rows = retry.read(engine, lambda c: list(c.execute(query)))
-    return [OpenItem(int(index), int(attempts), bool(is_held)) for index, attempts, is_held in rows]
+    claims = [_claim(recording_id, row) for row in rows]
+    return [OpenItem(claim.frame_index, claim.token, bool(row[2])) for claim, row in zip(claims, rows, strict=True)]
 
 
 def unsent(engine: Engine) -> int:
@@ -260,7 +269,10 @@ def lost(engine: Engine, recording_id: int | None = None, *, all_pending: bool =
         query = query.join(recordings, recordings.c.id == _item.recording_id).where(due, _for_workers())
         found: dict[tuple[int, str], list[int]] = {}
         for row in connection.execute(query.order_by(recordings.c.id, _item.frame_index)):
-            found.setdefault((int(row.id), str(row.source)), []).append(int(row.frame_index))
+            where = f"of recording {row.id}"
+            source = checked.text(row.source, f"recordings.source {where}", checked.MOST_JSON)
+            index = checked.integer(row.frame_index, f"ingest_items.frame_index {where}")
+            found.setdefault((row.id, source), []).append(index)
         return [QueuedItems(key, source, tuple(indexes)) for (key, source), indexes in found.items()]
 
     return retry.write(engine, work)

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
-from sqlalchemy import Connection, Engine, exists, select
+from collections.abc import Callable
+from typing import Any
 
-from semdb.database import retry
-from semdb.database.reading import camera_from_row
+from sqlalchemy import Connection, Engine, exists, select
+from sqlalchemy.sql.elements import ColumnElement
+
+from semdb.database import checked, retry
+from semdb.database.planning import ROLES, model_of
+from semdb.database.reading import depth_scale_of
 from semdb.database.records import MapHead
 from semdb.database.tables import (
     cameras,
@@ -20,30 +25,42 @@ from semdb.database.tables import (
     recordings,
     refinements,
 )
-from semdb.errors import NotFoundError
+from semdb.errors import CodecError, NotFoundError
 from semdb.types import Camera, ModelInfo
 
 
 def map_heads(engine: Engine) -> list[MapHead]:
-    """All maps by id, with what a query must be made with: three small queries, whatever the maps hold."""
+    """All maps by id, with what a query must be made with: three small queries, whatever the maps hold.
+
+    A map whose rows are damaged says so itself, since the others can be used.
+    """
     holds = exists().where(keyframes.c.recording_id == recordings.c.id, recordings.c.map_id == maps.c.id)
     heads = select(maps.c.id, maps.c.name, holds).order_by(maps.c.id)
     m, r = models.c, refinements.c
-    made_by = select(map_models.c.map_id, m.role, m.name, m.sha256, m.config)
+    made_by = select(map_models.c.map_id, m.id, m.role, m.name, m.sha256, checked.up_to(m.config, checked.MOST_JSON))
     made_by = made_by.join(models, m.id == map_models.c.model_id).order_by(map_models.c.map_id, m.role)
-    steps = select(r.map_id, r.kind, r.map_state, r.parameters, r.computed_at, r.row_count).order_by(r.map_id, r.kind)
+    parameters = checked.up_to(r.parameters, checked.MOST_JSON)
+    steps = select(r.map_id, r.kind, r.map_state, parameters, r.computed_at, r.row_count).order_by(r.map_id, r.kind)
 
     def work(connection: Connection) -> list[MapHead]:
         infos: dict[int, list[ModelInfo]] = {}
-        for map_id, *info in connection.execute(made_by):
-            infos.setdefault(map_id, []).append(ModelInfo(*info))
+        damage: dict[int, str] = {}
+        for row in connection.execute(made_by):
+            try:
+                infos.setdefault(row.map_id, []).append(model_of(row))
+            except CodecError as error:
+                damage.setdefault(row.map_id, str(error))
         refined: dict[int, list[str]] = {}
         for map_id, *step in connection.execute(steps):
             refined.setdefault(map_id, []).append(" ".join(map(str, step)))
-        return [
-            MapHead(int(key), name, tuple(infos.get(key, ())), tuple(refined.get(key, ())), bool(there))
-            for key, name, there in connection.execute(heads)
-        ]
+        found = []
+        for key, name, there in connection.execute(heads):
+            made = tuple(infos.get(key, ()))
+            missing = [role for role in ROLES if there and all(info.role != role for info in made)]
+            lacks = f"map_models of map {key} name no {' and no '.join(missing)}" if missing else ""
+            known = checked.text(name, f"maps.name of map {key}")
+            found.append(MapHead(key, known, made, tuple(refined.get(key, ())), bool(there), damage.get(key, lacks)))
+        return found
 
     return retry.read(engine, work)
 
@@ -57,18 +74,35 @@ def planned_frames(engine: Engine, map_name: str, recording: str) -> tuple[int, 
         .where(maps.c.name == map_name, recordings.c.name == recording)
         .order_by(ingest_items.c.frame_index)
     )
-    return retry.read(engine, lambda c: tuple(int(index) for index in c.execute(query).scalars()))
+    rows = retry.read(engine, lambda c: list(c.execute(query).scalars()))
+    return tuple(checked.integer(index, f"ingest_items.frame_index of the recording {recording!r}") for index in rows)
 
 
-def map_cameras(engine: Engine, map_id: int) -> list[Camera]:
-    """The different cameras of a map's keyframes, in the order of their ids."""
+def map_cameras(engine: Engine, map_id: int, say: Callable[[str], None] | None = None) -> list[Camera]:
+    """The different cameras of a map's keyframes, in the order of their ids.
+
+    One that is none is left out and told to `say`, or raises CodecError.
+    """
     used = (
         select(keyframes.c.camera_id)
         .join(recordings, recordings.c.id == keyframes.c.recording_id)
         .where(recordings.c.map_id == map_id)
     )
-    query = select(cameras).where(cameras.c.id.in_(used)).order_by(cameras.c.id)
-    return retry.read(engine, lambda c: [camera_from_row(row) for row in c.execute(query)])
+    query = select(*_camera_columns()).where(cameras.c.id.in_(used)).order_by(cameras.c.id)
+    found = []
+    for row in retry.read(engine, lambda c: list(c.execute(query))):
+        try:
+            found.append(checked.camera(row, f"camera {row.id}"))
+        except CodecError as error:
+            if say is None:
+                raise
+            say(f"a camera is left out: {error}")
+    return found
+
+
+def _camera_columns() -> list[ColumnElement[Any]]:
+    distortion = checked.up_to(cameras.c.distortion, checked.MOST_DISTORTION)
+    return [distortion if column.name == "distortion" else column for column in cameras.c]
 
 
 def recording_camera(engine: Engine, recording_id: int) -> tuple[Camera, float | None]:
@@ -79,7 +113,7 @@ def recording_camera(engine: Engine, recording_id: int) -> tuple[Camera, float |
 
     def work(connection: Connection) -> tuple[Camera, float | None]:
         query = (
-            select(cameras, keyframe_images.c.depth_scale)
+            select(*_camera_columns(), keyframe_images.c.depth_scale, keyframe_images.c.keyframe_id)
             .join(keyframes, keyframes.c.camera_id == cameras.c.id)
             .join(keyframe_images, keyframe_images.c.keyframe_id == keyframes.c.id)
             .where(keyframes.c.recording_id == recording_id)
@@ -89,7 +123,7 @@ def recording_camera(engine: Engine, recording_id: int) -> tuple[Camera, float |
         row = connection.execute(query).first()
         if row is None:
             raise NotFoundError(f"recording {recording_id} has no keyframe, so its camera is not known")
-        return camera_from_row(row), row.depth_scale
+        return checked.camera(row, f"camera {row.id}"), depth_scale_of(row.depth_scale, row.keyframe_id)
 
     return retry.read(engine, work)
 
@@ -102,4 +136,6 @@ def category_counts(engine: Engine, map_id: int) -> list[tuple[int, str, int]]:
         .join(categories, categories.c.id == table.category_id)
         .where(table.map_id == map_id, table.count > 0)
     )
-    return retry.read(engine, lambda c: [(int(key), str(name), int(count)) for key, name, count in c.execute(query)])
+    rows = retry.read(engine, lambda c: list(c.execute(query)))
+    where = "keyframe_categories.count of keyframe"
+    return [(int(key), str(name), checked.integer(count, f"{where} {key}")) for key, name, count in rows]

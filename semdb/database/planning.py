@@ -9,7 +9,7 @@ from typing import Any
 from sqlalchemy import Connection, Engine, Row, func, insert, select, update
 from sqlalchemy.exc import IntegrityError
 
-from semdb.database import retry
+from semdb.database import checked, retry
 from semdb.database.ids import SharedIds, check_name, new_id
 from semdb.database.records import (
     FailedItem,
@@ -20,7 +20,7 @@ from semdb.database.records import (
     RecordingState,
 )
 from semdb.database.tables import ingest_items, keyframes, map_models, maps, models, recordings
-from semdb.errors import DatabaseError, NotFoundError, ProvenanceError, UsageError
+from semdb.errors import CodecError, DatabaseError, NotFoundError, ProvenanceError, UsageError
 from semdb.shown import for_terminal
 from semdb.types import ModelInfo
 
@@ -53,18 +53,39 @@ def list_maps(engine: Engine) -> list[MapInfo]:
         .scalar_subquery()
     )
     query = select(maps.c.id, maps.c.name, count_keyframes, count_recordings).order_by(maps.c.id)
-    return retry.read(engine, lambda c: [MapInfo(*row) for row in c.execute(query)])
+    rows = retry.read(engine, lambda c: list(c.execute(query)))
+    return [MapInfo(row.id, checked.text(row.name, f"maps.name of map {row.id}"), row[2], row[3]) for row in rows]
 
 
 def map_model_ids(connection: Connection, map_id: int) -> dict[ModelInfo, int]:
-    """The models that describe a map, by role, with their ids."""
+    """The models that describe a map, by role, with their ids. Raises CodecError for what is no model."""
+    config = checked.up_to(models.c.config, checked.MOST_JSON)
     query = (
-        select(models.c.role, models.c.name, models.c.sha256, models.c.config, models.c.id)
+        select(models.c.role, models.c.name, models.c.sha256, config, models.c.id)
         .join(map_models, map_models.c.model_id == models.c.id)
         .where(map_models.c.map_id == map_id)
         .order_by(models.c.role)
     )
-    return {ModelInfo(*row[:4]): row[4] for row in connection.execute(query)}
+    found = {model_of(row): row.id for row in connection.execute(query)}
+    missing = [role for role in ROLES if all(info.role != role for info in found)]
+    if found and missing:
+        raise CodecError(
+            f"map_models of map {map_id} name no {' and no '.join(missing)}: the map cannot be compared with"
+        )
+    return found
+
+
+def model_of(row: Any) -> ModelInfo:
+    """The model of a row that has the columns of `models`. Raises CodecError."""
+
+    def where(column: str) -> str:
+        return f"models.{column} of model {row.id}"
+
+    if row.role not in ROLES:
+        raise CodecError(f"{where('role')} is {checked.shown(row.role)}, not one of {', '.join(ROLES)}")
+    checked.mapping(row.config, where("config"))
+    sha256 = checked.text(row.sha256, where("sha256"), 64)
+    return ModelInfo(row.role, checked.text(row.name, where("name")), sha256, row.config)
 
 
 def check_models(stored: Iterable[ModelInfo], given: Iterable[ModelInfo], what: str) -> None:
@@ -140,7 +161,14 @@ def stored_plan(engine: Engine, recording_id: int) -> StoredPlan:
             raise NotFoundError(f"there is no recording with the id {recording_id}")
         query = select(ingest_items.c.frame_index).where(ingest_items.c.recording_id == recording_id)
         indexes = connection.execute(query.order_by(ingest_items.c.frame_index)).scalars()
-        return StoredPlan(row.id, row.map_id, row.source, row.fingerprint, tuple(int(index) for index in indexes))
+        where = f"of recording {row.id}"
+        return StoredPlan(
+            row.id,
+            row.map_id,
+            checked.text(row.source, f"recordings.source {where}", checked.MOST_JSON),
+            checked.text(row.fingerprint, f"recordings.fingerprint {where}", 64),
+            tuple(checked.integer(index, f"ingest_items.frame_index {where}") for index in indexes),
+        )
 
     return retry.read(engine, work)
 
@@ -191,7 +219,11 @@ def _resume(connection: Connection, row: Row[Any], plan: RecordingPlan, map_name
             f"their poses are others now; {advice}"
         )
     query = select(ingest_items.c.frame_index, ingest_items.c.state).where(ingest_items.c.recording_id == row.id)
-    states = {row.frame_index: row.state for row in connection.execute(query.order_by(ingest_items.c.frame_index))}
+    where = f"of recording {row.id}"
+    states = {
+        checked.integer(index, f"ingest_items.frame_index {where}"): state
+        for index, state in connection.execute(query.order_by(ingest_items.c.frame_index))
+    }
     if set(states) != set(plan.frame_indexes):
         only_old, only_new = (
             sorted(set(states) - set(plan.frame_indexes)),
@@ -242,7 +274,17 @@ def failed_items(engine: Engine, recording_id: int | None = None) -> list[Failed
     query = query.where(item.state == ItemState.FAILED.value).order_by(item.recording_id, item.frame_index)
     if recording_id is not None:
         query = query.where(item.recording_id == recording_id)
-    return retry.read(engine, lambda c: [FailedItem(*row[:3], row[3] or "") for row in c.execute(query)])
+    return [_failed(row) for row in retry.read(engine, lambda c: list(c.execute(query)))]
+
+
+def _failed(row: Any) -> FailedItem:
+    where = f"of frame {checked.shown(row.frame_index)} of recording {row.recording_id}"
+    return FailedItem(
+        row.recording_id,
+        checked.integer(row.frame_index, f"ingest_items.frame_index {where}"),
+        checked.integer(row.attempts, f"ingest_items.attempts {where}"),
+        checked.text(row.error or "", f"ingest_items.error {where}", 65_535),
+    )
 
 
 def finish_recording(engine: Engine, recording_id: int) -> RecordingState:
@@ -260,7 +302,7 @@ def finish_recording(engine: Engine, recording_id: int) -> RecordingState:
             ingest_items.c.state.in_([ItemState.PENDING.value, ItemState.RUNNING.value]),
         )
         if connection.execute(left).scalar() or state in (RecordingState.COMPLETE, RecordingState.DELETING):
-            return RecordingState(state)
+            return checked.choice(state, f"recordings.state of recording {recording_id}", RecordingState)
         values = {"state": RecordingState.COMPLETE.value, "finished_at": func.current_timestamp()}
         connection.execute(update(recordings).where(recordings.c.id == recording_id).values(values))
         return RecordingState.COMPLETE

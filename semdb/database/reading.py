@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 from sqlalchemy import Connection, Engine, Select, select
 
-from semdb.database import retry
-from semdb.database.codecs import decode_array, decode_keypoints, decode_mask, decode_vectors, keypoint_rows
-from semdb.database.records import KeyframeHead, StoredImage, StoredKeyframe, StoredObject
+from semdb.database import checked, retry
+from semdb.database.codecs import decode_mask, decode_vectors
+from semdb.database.keyframe_rows import POSE, KeyframeRows, head_of, keyframe_of
+from semdb.database.records import KeyframeHead, StoredImage, StoredKeyframe
 from semdb.database.tables import (
     cameras,
     categories,
@@ -26,10 +27,12 @@ from semdb.database.tables import (
     recordings,
 )
 from semdb.errors import CodecError, NotFoundError
-from semdb.geometry import pose_from, rotation_from_quat_wxyz, rotations_from_quats_wxyz
-from semdb.types import BoolArray, Camera, Float32Array, FloatArray, ObjectGeometry
+from semdb.geometry import rotations_from_quats_wxyz
+from semdb.types import BoolArray, Float32Array, FloatArray
 
 CHUNK = 500
+Bad = Callable[[int, CodecError], None]  # takes a keyframe that is left out, and why
+_FORMATS = ("", "png", "jpeg")
 
 
 def _chunked(
@@ -59,161 +62,123 @@ def keyframe_ids(engine: Engine, map_id: int) -> list[int]:
     return retry.read(engine, lambda c: list(c.execute(query).scalars()))
 
 
+def check_keyframes(engine: Engine, keys: Sequence[int]) -> None:
+    """Raises NotFoundError for a keyframe that is not there."""
+    keys = _ints(keys)
+    k = keyframes.c
+    there = retry.read(engine, lambda c: set(_chunked(c, keys, lambda chunk: select(k.id).where(k.id.in_(chunk)))))
+    _missing(keys, {key for (key,) in there}, "keyframe")
+
+
 def load_vectors(engine: Engine, keys: Sequence[int]) -> Float32Array:
     """CNN vectors float32 ``[n, d]`` of keyframes in the order of `keys` (``[0, 0]`` for none).
 
     Raises NotFoundError for a keyframe that is not there, CodecError for a damaged one.
     """
     keys = _ints(keys)
+    c = cnn_vectors.c
+    vector = checked.up_to(c.vector, checked.MOST_VECTOR)
 
     def work(connection: Connection) -> dict[int, bytes]:
-        c = cnn_vectors.c
-        rows = _chunked(connection, keys, lambda chunk: select(c.keyframe_id, c.vector).where(c.keyframe_id.in_(chunk)))
+        rows = _chunked(connection, keys, lambda chunk: select(c.keyframe_id, vector).where(c.keyframe_id.in_(chunk)))
         return {row.keyframe_id: row.vector for row in rows}
 
     blobs = retry.read(engine, work)
     _missing(keys, blobs, "vector of the keyframe")
-    return decode_vectors([blobs[key] for key in keys], "cnn_vectors of keyframe", np.array(keys, np.int64))
+    return decode_vectors([blobs[key] for key in keys], np.array(keys, np.int64))
 
 
-def _pose(row: Any) -> FloatArray:
-    return pose_from(rotation_from_quat_wxyz([row.qw, row.qx, row.qy, row.qz]), [row.tx, row.ty, row.tz])
-
-
-def poses(engine: Engine, map_id: int, keys: Sequence[int] | None = None) -> tuple[list[int], FloatArray]:
+def poses(
+    engine: Engine, map_id: int, keys: Sequence[int] | None = None, bad: Bad | None = None
+) -> tuple[list[int], FloatArray]:
     """Ids (ascending) and poses float64 ``[n, 4, 4]`` of the keyframes of a map.
 
-    With `keys`, of those of them that are in the map.
+    With `keys`, of those of them that are in the map. A pose that is none is left out and told to `bad`, or raises
+    CodecError.
     """
     k = keyframes.c
-    query = select(k.id, k.qw, k.qx, k.qy, k.qz, k.tx, k.ty, k.tz).join(recordings).where(recordings.c.map_id == map_id)
+    query = select(k.id, *(k[name] for name in POSE)).join(recordings).where(recordings.c.map_id == map_id)
 
     def work(connection: Connection) -> list[Any]:
         if keys is None:
             return list(connection.execute(query))
         return list(_chunked(connection, _ints(keys), lambda chunk: query.where(k.id.in_(chunk))))
 
-    rows = sorted(map(tuple, retry.read(engine, work)))
-    numbers = np.array([row[1:] for row in rows], dtype=np.float64).reshape(-1, 7)
-    matrices = np.zeros((len(rows), 4, 4))
+    rows = sorted(map(tuple, retry.read(engine, work)), key=lambda row: row[0])
+    numbers = checked.numbers_of([row[1:] for row in rows], len(POSE))
+    usable = checked.are_poses(numbers)
+    for place in np.flatnonzero(~usable):
+        try:
+            checked.pose_numbers(rows[place][1:], f"keyframe {rows[place][0]}")
+        except CodecError as error:
+            _leave_out(bad, rows[place][0], error)
+    numbers = numbers[usable]
+    matrices = np.zeros((len(numbers), 4, 4))
     matrices[:, :3, :3] = rotations_from_quats_wxyz(numbers[:, :4])
     matrices[:, :3, 3] = numbers[:, 4:]
     matrices[:, 3, 3] = 1.0
-    return [row[0] for row in rows], matrices
+    return [rows[place][0] for place in np.flatnonzero(usable)], matrices
 
 
-def load_keyframes(engine: Engine, keys: Sequence[int], *, with_descriptors: bool = True) -> list[StoredKeyframe]:
+def _leave_out(bad: Bad | None, keyframe_id: int, error: CodecError) -> None:
+    if bad is None:
+        raise error
+    bad(keyframe_id, error)
+
+
+def load_keyframes(
+    engine: Engine, keys: Sequence[int], *, with_descriptors: bool = True, bad: Bad | None = None
+) -> list[StoredKeyframe]:
     """Keyframes with objects and keypoints, in the order of `keys`.
 
-    Without descriptors theirs have the shape ``[n, 0]``. Raises NotFoundError, CodecError.
+    Without descriptors theirs have the shape ``[n, 0]``. Raises NotFoundError; a damaged keyframe is left out and told
+    to `bad`, or raises CodecError.
     """
     keys = _ints(keys)
-    rows = retry.read(engine, lambda connection: _keyframe_rows(connection, keys, with_descriptors))
-    _missing(keys, rows["frames"], "keyframe")
-    return [_keyframe(rows, key, with_descriptors) for key in keys]
+    once = list(dict.fromkeys(keys))
+    rows = retry.read(engine, lambda connection: _keyframe_rows(connection, once, with_descriptors))
+    _missing(keys, rows.frames, "keyframe")
+    found = []
+    for key in keys:
+        try:
+            found.append(keyframe_of(rows, key))
+        except CodecError as error:
+            _leave_out(bad, key, error)
+    return found
 
 
-def _keyframe_rows(connection: Connection, keys: Sequence[int], with_descriptors: bool) -> dict[str, dict[int, Any]]:
-    k, o = keyframes.c, objects.c
-    frame_columns = (k, cameras.c, recordings.c)
-    rows: dict[str, dict[int, Any]] = {
-        "frames": {
-            row.id: row
-            for row in _chunked(
-                connection,
-                keys,
-                lambda chunk: (
-                    select(
-                        *(column for column in frame_columns[0]),
-                        *(column for column in frame_columns[1] if column.name not in ("id", "digest")),
-                        recordings.c.map_id,
-                        recordings.c.name.label("recording"),
-                    )
-                    .join(cameras, cameras.c.id == k.camera_id)
-                    .join(recordings, recordings.c.id == k.recording_id)
-                    .where(k.id.in_(chunk))
-                ),
-            )
-        },
-        "objects": {},
-        "keypoints": {
-            row.keyframe_id: row.data
-            for row in _chunked(
-                connection,
-                keys,
-                lambda chunk: select(keypoints.c.keyframe_id, keypoints.c.data).where(
-                    keypoints.c.keyframe_id.in_(chunk)
-                ),
-            )
-        },
-        "descriptors": {},
-    }
-    columns = [column for column in o if column.name != "mask"]
-    for row in _chunked(
-        connection,
-        keys,
-        lambda chunk: (
-            select(*columns, categories.c.name, object_features.c.start, object_features.c.count)
-            .join(categories, categories.c.id == o.category_id)
-            .join(object_features, object_features.c.object_id == o.id)
-            .where(o.keyframe_id.in_(chunk))
-            .order_by(o.keyframe_id, o.ordinal)
-        ),
-    ):
-        rows["objects"].setdefault(row.keyframe_id, []).append(row)
+def _keyframe_rows(connection: Connection, keys: Sequence[int], with_descriptors: bool) -> KeyframeRows:
+    k, c, o, p, d = keyframes.c, cameras.c, objects.c, keypoints.c, descriptors.c
+    of_camera = [column for column in c if column.name not in ("id", "digest", "distortion")]
+    frames = (
+        select(*k, *of_camera, checked.up_to(c.distortion, checked.MOST_DISTORTION), recordings.c.map_id)
+        .add_columns(recordings.c.name.label("recording"), maps.c.name.label("map"))
+        .join(cameras, c.id == k.camera_id, isouter=True)
+        .join(recordings, recordings.c.id == k.recording_id)
+        .join(maps, maps.c.id == recordings.c.map_id)
+    )
+    features = select(p.keyframe_id, p.count, checked.up_to(p.data, checked.MOST_KEYPOINTS))
+    described = select(d.keyframe_id, checked.up_to(d.data, checked.MOST_DESCRIPTORS))
+    things = (
+        select(*(column for column in o if column.name != "mask"), categories.c.name)
+        .add_columns(object_features.c.start, object_features.c.count)
+        .join(categories, categories.c.id == o.category_id, isouter=True)
+        .join(object_features, object_features.c.object_id == o.id, isouter=True)
+        .order_by(o.keyframe_id, o.ordinal)
+    )
+
+    def each(query: Select[Any], column: Any) -> Iterator[Any]:
+        return _chunked(connection, keys, lambda chunk: query.where(column.in_(chunk)))
+
+    rows = KeyframeRows(
+        frames={row.id: row for row in each(frames, k.id)},
+        keypoints={row.keyframe_id: row for row in each(features, p.keyframe_id)},
+    )
+    for row in each(things, o.keyframe_id):
+        rows.objects.setdefault(row.keyframe_id, []).append(row)
     if with_descriptors:
-        d = descriptors.c
-        for item in _chunked(
-            connection, keys, lambda chunk: select(d.keyframe_id, d.data).where(d.keyframe_id.in_(chunk))
-        ):
-            rows["descriptors"][item.keyframe_id] = item.data
+        rows.descriptors = {row.keyframe_id: row for row in each(described, d.keyframe_id)}
     return rows
-
-
-def _keyframe(rows: dict[str, dict[int, Any]], key: int, with_descriptors: bool) -> StoredKeyframe:
-    row = rows["frames"][key]
-    object_rows = rows["objects"].get(key, [])
-    blob = rows["keypoints"].get(key)
-    if blob is None or (with_descriptors and key not in rows["descriptors"]):
-        raise CodecError(f"keyframe {key} has no keypoints: delete its recording and ingest it again")
-    described = decode_array(rows["descriptors"][key], f"descriptors of keyframe {key}") if with_descriptors else None
-    count = len(keypoint_rows(blob, f"keypoints of keyframe {key}"))
-    object_index = np.full(count, -1, dtype=np.int32)
-    for item in object_rows:
-        # "count" is also a method of a row
-        object_index[item.start : item.start + item._mapping["count"]] = item.ordinal
-    return StoredKeyframe(
-        id=row.id,
-        map_id=row.map_id,
-        recording_id=row.recording_id,
-        recording=row.recording,
-        frame_index=row.frame_index,
-        timestamp_ns=row.timestamp_ns,
-        camera=camera_from_row(row),
-        world_from_camera=_pose(row),
-        objects=tuple(_object(item) for item in object_rows),
-        keypoints=decode_keypoints(blob, described, object_index, f"keypoints of keyframe {key}"),
-    )
-
-
-def camera_from_row(row: Any) -> Camera:
-    """The camera of a row that has the columns of `cameras`."""
-    return Camera(row.width, row.height, row.fx, row.fy, row.cx, row.cy, tuple(json.loads(row.distortion)))
-
-
-def _object(row: Any) -> StoredObject:
-    def triple(name: str) -> FloatArray:
-        values = [getattr(row, f"{name}_{axis}") for axis in "xyz"]
-        return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
-
-    return StoredObject(
-        id=row.id,
-        ordinal=row.ordinal,
-        category=row.name,
-        score=row.score,
-        box=np.array([row.x1, row.y1, row.x2, row.y2], dtype=np.float32),
-        geometry=ObjectGeometry(row.pixel_area, triple("centroid"), triple("extent")),
-    )
 
 
 def keyframe_heads(
@@ -224,23 +189,21 @@ def keyframe_heads(
     recording_id: int | None = None,
     after: int = 0,
     limit: int | None = None,
+    bad: Bad | None = None,
 ) -> list[KeyframeHead]:
     """Keyframes without what is large, by ascending id: those of `keys`, or of a map or recording, after an id.
 
-    Raises NotFoundError for one of `keys` that is not there.
+    Raises NotFoundError for one of `keys` that is not there; a damaged one is left out and told to `bad`, or raises
+    CodecError.
     """
-    k, r = keyframes.c, recordings.c
+    k, c, r = keyframes.c, cameras.c, recordings.c
+    of_camera = [column for column in c if column.name not in ("id", "digest", "distortion")]
     query = (
-        select(
-            *(column for column in k),
-            *(column for column in cameras.c if column.name not in ("id", "digest")),
-            r.name.label("recording"),
-            maps.c.name.label("map"),
-        )
-        .join(cameras, cameras.c.id == k.camera_id)
+        select(*k, *of_camera, checked.up_to(c.distortion, checked.MOST_DISTORTION))
+        .add_columns(r.name.label("recording"), maps.c.name.label("map"), r.map_id)
+        .join(cameras, c.id == k.camera_id, isouter=True)
         .join(recordings, r.id == k.recording_id)
         .join(maps, maps.c.id == r.map_id)
-        .where(k.id > after)
         .order_by(k.id)
     )
     if map_id is not None:
@@ -248,41 +211,76 @@ def keyframe_heads(
     if recording_id is not None:
         query = query.where(k.recording_id == recording_id)
 
-    def work(connection: Connection) -> list[Any]:
+    def page(connection: Connection, start: int, size: int | None) -> list[Any]:
         if keys is None:
-            return list(connection.execute(query.limit(limit)))
-        return list(_chunked(connection, _ints(keys), lambda chunk: query.where(k.id.in_(chunk))))
+            return list(connection.execute(query.where(k.id > start).limit(size)))
+        return list(_chunked(connection, _ints(keys), lambda chunk: query.where(k.id > start, k.id.in_(chunk))))
 
-    rows = retry.read(engine, work)
-    if keys is not None:
-        _missing(_ints(keys), {row.id for row in rows}, "keyframe")
-    return [
-        KeyframeHead(
-            id=row.id,
-            map=row.map,
-            recording=row.recording,
-            frame_index=row.frame_index,
-            timestamp_ns=row.timestamp_ns,
-            camera=camera_from_row(row),
-            world_from_camera=_pose(row),
-        )
-        for row in rows
-    ]
+    found: list[KeyframeHead] = []
+    while True:
+        wanted = None if limit is None else limit - len(found)
+        rows = retry.read(engine, partial(page, start=after, size=wanted))
+        if keys is not None:
+            _missing(_ints(keys), {row.id for row in rows}, "keyframe")
+        for row in rows:
+            try:
+                found.append(head_of(row))
+            except CodecError as error:
+                _leave_out(bad, row.id, error)
+        if wanted is None or keys is not None or len(rows) < wanted or len(found) == limit:
+            return found
+        after = rows[-1].id  # damaged ones must not make a page look like the last
 
 
 def load_image(engine: Engine, keyframe_id: int) -> StoredImage:
-    """The files of a keyframe as recorded. Raises NotFoundError."""
+    """The files of a keyframe as recorded. Raises NotFoundError, CodecError."""
     c = keyframe_images.c
-    query = select(c.rgb, c.rgb_format, c.depth, c.depth_format, c.depth_scale, c.depth_registration)
+    rgb, depth = (checked.up_to(column, checked.MOST_FILE) for column in (c.rgb, c.depth))
+    query = select(rgb, c.rgb_format, depth, c.depth_format, c.depth_scale, c.depth_registration)
     query = query.where(c.keyframe_id == int(keyframe_id))
     row = retry.read(engine, lambda connection: connection.execute(query).one_or_none())
     if row is None:
         raise NotFoundError(f"there is no image of the keyframe {keyframe_id}")
-    return StoredImage(*row)
+
+    def name(column: str) -> str:
+        return f"keyframe_images.{column} of keyframe {keyframe_id}"
+
+    return StoredImage(
+        rgb=checked.blob(row.rgb, name("rgb")),
+        rgb_format=_format(row.rgb_format, name("rgb_format")),
+        depth=None if row.depth is None else checked.blob(row.depth, name("depth")),
+        depth_format=_format(row.depth_format, name("depth_format")),
+        depth_scale=depth_scale_of(row.depth_scale, keyframe_id),
+        depth_registration=checked.text(row.depth_registration, name("depth_registration"), 32),
+    )
+
+
+def depth_scale_of(value: Any, keyframe_id: int) -> float | None:
+    """Units per metre, None where there is no depth. Raises CodecError."""
+    where = f"keyframe_images.depth_scale of keyframe {keyframe_id}"
+    return None if value is None else checked.real(value, where, 1e-6, 1e9)
+
+
+def _format(value: Any, where: str) -> str:
+    if value not in _FORMATS:
+        raise CodecError(f"{where} is {checked.shown(value)}, not png, jpeg or empty")
+    return str(value)
 
 
 def load_masks(engine: Engine, keyframe_id: int) -> tuple[BoolArray, ...]:
-    """Masks ``[H, W]`` of the objects of a keyframe, by ordinal (none for a keyframe without objects)."""
-    query = select(objects.c.ordinal, objects.c.mask).where(objects.c.keyframe_id == int(keyframe_id))
-    rows = retry.read(engine, lambda c: list(c.execute(query.order_by(objects.c.ordinal))))
-    return tuple(decode_mask(blob, f"mask of object {ordinal} of keyframe {keyframe_id}") for ordinal, blob in rows)
+    """Masks ``[H, W]`` of the objects of a keyframe, by ordinal (none for a keyframe without objects).
+
+    Raises CodecError, also for one of another size than the camera's.
+    """
+    query = (
+        select(objects.c.id, checked.up_to(objects.c.mask, checked.MOST_MASK), cameras.c.width, cameras.c.height)
+        .join(keyframes, keyframes.c.id == objects.c.keyframe_id)
+        .join(cameras, cameras.c.id == keyframes.c.camera_id)
+        .where(objects.c.keyframe_id == int(keyframe_id))
+        .order_by(objects.c.ordinal)
+    )
+    masks = []
+    for row in retry.read(engine, lambda connection: list(connection.execute(query))):
+        where = f"objects.mask of object {row.id} (keyframe {keyframe_id})"
+        masks.append(decode_mask(checked.blob(row.mask, where), where, (row.height, row.width)))
+    return tuple(masks)

@@ -52,6 +52,7 @@ class MapHead:
     models: tuple[ModelInfo, ...]
     refined: tuple[str, ...]
     holds_keyframes: bool = field(compare=False)
+    damage: str = ""  # why the map cannot be asked, where its rows are damaged
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,14 +10,19 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-from sqlalchemy import BigInteger, Connection, Engine, Select, cast, delete, func, insert, select, update
+from sqlalchemy import BigInteger, Connection, Engine, Select, case, cast, delete, func, insert, select, update
 from sqlalchemy.exc import IntegrityError
+from sqlalchemy.sql.elements import ColumnElement
 
-from semdb.database import retry
+from semdb.database import checked, retry
+from semdb.database.exact_sums import exact_sum, whole
+from semdb.database.keyframe_rows import FARTHEST_POINT_M, POSE, pose_of
+from semdb.database.point_rows import listed_keyframes
+from semdb.database.reading import Bad
 from semdb.database.records import ClassConfusion, MapObject, Refinement
 from semdb.database.tables import categories, class_confusions, keyframes, maps, objects, recordings, refinements
-from semdb.errors import NotFoundError
-from semdb.geometry import pose_from, rotation_from_quat_wxyz
+from semdb.errors import CodecError, NotFoundError
+from semdb.geometry import FARTHEST_POSE_M
 
 CLASSES, POINTS = "classes", "points"  # kinds: steps of `semdb refine`
 CHUNK = 500
@@ -38,44 +43,61 @@ def map_state(engine: Engine, map_id: int) -> str:
 def _map_state(connection: Connection, map_id: int) -> str:
     k = keyframes.c
     # weights, so that a turn or a move along any axis shows; integers, so that no order of adding does
-    mixed = k.qw + 2 * k.qx + 3 * k.qy + 5 * k.qz + 7 * k.tx + 11 * k.ty + 13 * k.tz
+    mixed = _within(k.qw, 1) + 2 * _within(k.qx, 1) + 3 * _within(k.qy, 1) + 5 * _within(k.qz, 1)
+    mixed = mixed + 7 * _within(k.tx) + 11 * _within(k.ty) + 13 * _within(k.tz)
     pose = cast(func.round(mixed * _MICRO), BigInteger)
-    query = (
-        select(
-            func.count(),
-            func.coalesce(func.max(k.id), 0),
-            func.coalesce(func.sum(k.id), 0),
-            func.coalesce(func.sum(pose), 0),
-        )
-        .select_from(keyframes.join(recordings))
-        .where(recordings.c.map_id == map_id)
-    )
-    return " ".join(str(int(value)) for value in connection.execute(query).one())
+    ids, poses = exact_sum(connection.engine, k.id), exact_sum(connection.engine, pose)
+    query = select(func.count(), func.coalesce(func.max(k.id), 0), *ids, *poses)
+    query = query.select_from(keyframes.join(recordings)).where(recordings.c.map_id == map_id)
+    number, newest, *sums = connection.execute(query).one()
+    return f"{int(number)} {int(newest)} {whole(sums[: len(ids)])} {whole(sums[len(ids) :])}"
 
 
-def list_refinements(engine: Engine, map_id: int | None = None) -> list[Refinement]:
-    """The refinements of a map, or of all maps, by map and kind; each says whether the map is still the same."""
+def _within(column: ColumnElement[float], most: float = FARTHEST_POSE_M) -> ColumnElement[float]:
+    """A number of a pose; 0 for one that no pose has, which could overflow, and which is left out elsewhere."""
+    return case((column.between(-2 * most, 2 * most), column), else_=0.0)
+
+
+def list_refinements(
+    engine: Engine, map_id: int | None = None, say: Callable[[str], None] | None = None
+) -> list[Refinement]:
+    """The refinements of a map, or of all maps, by map and kind; each says whether the map is still the same.
+
+    A row that is none is left out and told to `say`, or raises CodecError.
+    """
+    parameters = checked.up_to(refinements.c.parameters, checked.MOST_JSON)
+    columns = [parameters if column.name == "parameters" else column for column in refinements.c]
 
     def work(connection: Connection) -> list[Refinement]:
-        query = select(refinements, maps.c.name).join(maps).order_by(refinements.c.map_id, refinements.c.kind)
+        query = select(*columns, maps.c.name).join(maps).order_by(refinements.c.map_id, refinements.c.kind)
         if map_id is not None:
             query = query.where(refinements.c.map_id == map_id)
         rows = list(connection.execute(query))
         states = {key: _map_state(connection, key) for key in sorted({row.map_id for row in rows})}
-        return [
-            Refinement(
-                map_id=row.map_id,
-                map=row.name,
-                kind=row.kind,
-                current=row.map_state == states[row.map_id],
-                computed_at=row.computed_at,
-                parameters=json.loads(row.parameters),
-                rows=int(row.row_count),
-            )
-            for row in rows
-        ]
+        found = []
+        for row in rows:
+            try:
+                found.append(_refinement(row, states[row.map_id]))
+            except CodecError as error:
+                if say is None:
+                    raise
+                say(f"a result of semdb refine is left out, run semdb refine --force: {error}")
+        return found
 
     return retry.read(engine, work)
+
+
+def _refinement(row: Any, state: str) -> Refinement:
+    where = f"of step {checked.shown(row.kind)} of map {row.map_id}"
+    return Refinement(
+        map_id=row.map_id,
+        map=checked.text(row.name, f"maps.name of map {row.map_id}"),
+        kind=checked.text(row.kind, f"refinements.kind of map {row.map_id}", 32),
+        current=row.map_state == state,
+        computed_at=checked.moment(row.computed_at, f"refinements.computed_at {where}"),
+        parameters=checked.mapping(row.parameters, f"refinements.parameters {where}"),
+        rows=checked.integer(row.row_count, f"refinements.row_count {where}", 0, 2**63 - 1),
+    )
 
 
 def replace_refinement(
@@ -115,27 +137,23 @@ def replace_refinement(
         return retry.write(engine, work)  # another one made the row of the step between the two statements
 
 
-def iter_objects(engine: Engine, map_id: int, progress: Progress | None = None) -> Iterator[MapObject]:
+def iter_objects(
+    engine: Engine, map_id: int, progress: Progress | None = None, bad: Bad | None = None
+) -> Iterator[MapObject]:
     """All objects of a map that have a place in it, by recording's name, frame and ordinal.
 
-    Read in chunks, each a transaction of its own: what is deleted meanwhile is left out.
+    Read in chunks, each a transaction of its own: what is deleted meanwhile is left out. A keyframe with a damaged row
+    is left out and told to `bad`, or raises CodecError.
     """
-    k, r, o = keyframes.c, recordings.c, objects.c
-    listing = (
-        select(k.id, r.name, k.frame_index)
-        .select_from(keyframes.join(recordings))
-        .where(r.map_id == map_id)
-        .order_by(k.id)
-    )
-    listed = _rows(engine, listing)
-    listed.sort(key=lambda row: (row.name, row.frame_index))
+    k, o = keyframes.c, objects.c
+    listed = [item.id for item in listed_keyframes(engine, map_id)]
     columns = (
         *(k.qw, k.qx, k.qy, k.qz, k.tx, k.ty, k.tz),
         *(o.keyframe_id, categories.c.name, o.score),
         *(o.centroid_x, o.centroid_y, o.centroid_z, o.extent_x, o.extent_y, o.extent_z),
     )
     for start in range(0, len(listed), CHUNK):
-        ids = [row.id for row in listed[start : start + CHUNK]]
+        ids = listed[start : start + CHUNK]
         query = (
             select(*columns)
             .select_from(objects.join(keyframes).join(categories))
@@ -146,8 +164,12 @@ def iter_objects(engine: Engine, map_id: int, progress: Progress | None = None) 
         for row in _rows(engine, query):
             found.setdefault(row.keyframe_id, []).append(row)
         for place, key in enumerate(ids, start):
-            for row in found.get(key, ()):
-                yield _map_object(place, row)
+            try:
+                yield from [_map_object(place, row) for row in found.get(key, ())]
+            except CodecError as error:
+                if bad is None:
+                    raise
+                bad(key, error)
         if progress is not None:
             progress(min(start + CHUNK, len(listed)), len(listed))
 
@@ -157,15 +179,20 @@ def _rows(engine: Engine, query: Select[Any]) -> list[Any]:
 
 
 def _map_object(keyframe: int, row: Any) -> MapObject:
+    where = f"of an object of keyframe {row.keyframe_id}"
+
+    def place(name: str) -> tuple[float, float, float]:
+        limits = (-FARTHEST_POINT_M, FARTHEST_POINT_M)
+        x, y, z = (checked.real(getattr(row, f"{name}_{a}"), f"objects.{name}_{a} {where}", *limits) for a in "xyz")
+        return x, y, z
+
     return MapObject(
         keyframe=keyframe,
-        category=row.name,
-        score=row.score,
-        world_from_camera=pose_from(
-            rotation_from_quat_wxyz([row.qw, row.qx, row.qy, row.qz]), [row.tx, row.ty, row.tz]
-        ),
-        centroid=(row.centroid_x, row.centroid_y, row.centroid_z),
-        extent=(row.extent_x, row.extent_y, row.extent_z),
+        category=checked.text(row.name, f"categories.name {where}"),
+        score=checked.real(row.score, f"objects.score {where}", 0.0, 1.0),
+        world_from_camera=pose_of([getattr(row, name) for name in POSE], f"keyframe {row.keyframe_id}"),
+        centroid=place("centroid"),
+        extent=place("extent"),
     )
 
 
@@ -192,8 +219,11 @@ def replace_confusions(connection: Connection, map_id: int, confusions: Sequence
     return len(rows)
 
 
-def load_confusions(engine: Engine, map_id: int) -> list[ClassConfusion]:
-    """The class confusions of a map, by the names of the classes."""
+def load_confusions(engine: Engine, map_id: int, say: Callable[[str], None] | None = None) -> list[ClassConfusion]:
+    """The class confusions of a map, by the names of the classes.
+
+    A row that is none is left out and told to `say`, or raises CodecError.
+    """
     c, one, other = class_confusions.c, categories.alias("one"), categories.alias("other")
     query = (
         select(one.c.name, other.c.name, c.pairs, c.weight)
@@ -202,5 +232,22 @@ def load_confusions(engine: Engine, map_id: int) -> list[ClassConfusion]:
         )
         .where(c.map_id == map_id)
     )
-    rows = _rows(engine, query)
-    return [ClassConfusion(str(a), str(b), int(pairs), int(weight)) for a, b, pairs, weight in sorted(map(tuple, rows))]
+    found = []
+    for row in _rows(engine, query):
+        try:
+            found.append(_confusion(map_id, *row))
+        except CodecError as error:
+            if say is None:
+                raise
+            say(f"a confusion of classes is left out, run semdb refine --force: {error}")
+    return sorted(found, key=lambda item: (item.category, item.other))
+
+
+def _confusion(map_id: int, category: Any, other: Any, pairs: Any, weight: Any) -> ClassConfusion:
+    where = f"of {checked.shown(category)} and {checked.shown(other)} in map {map_id}"
+    return ClassConfusion(
+        checked.text(category, f"categories.name {where}"),
+        checked.text(other, f"categories.name {where}"),
+        checked.integer(pairs, f"class_confusions.pairs {where}", 0, 2**63 - 1),
+        checked.integer(weight, f"class_confusions.weight {where}", 0, _MICRO),
+    )

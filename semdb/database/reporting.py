@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from datetime import datetime
 from typing import Any
 
-from sqlalchemy import Connection, Engine, FromClause, func, select
+from sqlalchemy import Connection, Engine, FromClause, case, func, select
+from sqlalchemy.sql.elements import ColumnElement
 
-from semdb.database import retry
+from semdb.database import checked, retry
 from semdb.database.clock import now_plus
 from semdb.database.ids import new_id
 from semdb.database.records import ItemState, RecordingState, RecordingStatus
@@ -43,19 +43,17 @@ def status(engine: Engine, map_id: int | None = None) -> list[RecordingStatus]:
         by_state = select(i.recording_id, i.state, func.count()).group_by(i.state, i.recording_id)
         if map_id is not None:
             by_state = by_state.join(recordings, r.id == i.recording_id).where(r.map_id == map_id)
-        for recording_id, state, count in sorted(tuple(row) for row in connection.execute(by_state)):
+        for recording_id, state, count in connection.execute(by_state):
             items.setdefault(recording_id, {})[state] = count
-        image_bytes = func.sum(keyframe_images.c.rgb_bytes + keyframe_images.c.depth_bytes)
+        image_bytes = func.sum(_size(keyframe_images.c.rgb_bytes) + _size(keyframe_images.c.depth_bytes))
         frames = _sums(connection, map_id, func.count(keyframes.c.id))
         boxes = _sums(connection, map_id, func.count(objects.c.id), objects)
-        points = _sums(connection, map_id, func.sum(keypoints.c.count), keypoints)
+        points = _sums(connection, map_id, func.sum(_size(keypoints.c.count)), keypoints)
         size = _sums(connection, map_id, image_bytes, keyframe_images)
         return [
             RecordingStatus(
-                *row[:6],
-                state=RecordingState(row.state),
-                frame_count=row.frame_count,
-                items=items.get(row.id, {}),
+                **_recording(row),
+                items=_items(items.get(row.id, {}), row.id),
                 keyframes=frames.get(row.id, 0),
                 objects=boxes.get(row.id, 0),
                 keypoints=points.get(row.id, 0),
@@ -65,6 +63,33 @@ def status(engine: Engine, map_id: int | None = None) -> list[RecordingStatus]:
         ]
 
     return retry.read(engine, work)
+
+
+def _recording(row: Any) -> dict[str, Any]:
+    def where(column: str) -> str:
+        return f"recordings.{column} of recording {row.id}"
+
+    return {
+        "recording_id": row.id,
+        "map_id": row.map_id,
+        "map": checked.text(row[2], f"maps.name of map {row.map_id}"),
+        "name": checked.text(row[3], where("name")),
+        "format": checked.text(row.format, where("format"), 32),
+        "source": checked.text(row.source, where("source"), checked.MOST_JSON),
+        "state": checked.choice(row.state, where("state"), RecordingState),
+        "frame_count": checked.integer(row.frame_count, where("frame_count")),
+    }
+
+
+def _items(counts: dict[Any, int], recording_id: int) -> dict[str, int]:
+    """How many keyframes of a plan are in which state, by its name."""
+    where = f"ingest_items.state of recording {recording_id}"
+    return dict(sorted((checked.choice(state, where, ItemState).value, count) for state, count in counts.items()))
+
+
+def _size(column: ColumnElement[int]) -> ColumnElement[int]:
+    """A size or a number; 0 for what is none, which could overflow a sum."""
+    return case((column.between(0, checked.LARGEST), column), else_=0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,15 +113,14 @@ def workers(engine: Engine) -> list[WorkerStatus]:
     )
     found = []
     for name, count, until, now in retry.read(engine, lambda c: list(c.execute(query))):
-        parts = f"{name}!!!".split("!")
-        left = (_as_time(until) - _as_time(now)).total_seconds() if until is not None else 0.0
+        where = f"of worker {checked.shown(name)}"
+        parts = f"{checked.text(name, f'ingest_items.worker {where}')}!!!".split("!")
+        left = 0.0
+        if until is not None:
+            end = checked.moment(until, f"ingest_items.lease_until {where}")
+            left = (end - checked.moment(now, "the time of the database")).total_seconds()
         found.append(WorkerStatus(parts[0], parts[2], int(count), left))
     return found
-
-
-def _as_time(value: Any) -> datetime:
-    """SQLite gives the text of a time that a function made."""
-    return value if isinstance(value, datetime) else datetime.fromisoformat(str(value))
 
 
 def _sums(connection: Connection, map_id: int | None, value: Any, table: Any = None) -> dict[int, int]:

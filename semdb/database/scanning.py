@@ -6,38 +6,52 @@ import operator
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial, reduce
+from typing import Any
 
 import numpy as np
-from sqlalchemy import BigInteger, Connection, Engine, Select, case, func, literal, select
+from sqlalchemy import BigInteger, Connection, Engine, Select, and_, case, cast, func, literal, not_, select
 from sqlalchemy.sql.elements import ColumnElement
 
 from semdb.class_score import MOST_OBJECTS, Part, word
-from semdb.database import retry
+from semdb.database import checked, retry
 from semdb.database.codecs import decode_vectors
-from semdb.database.reading import keyframe_ids
+from semdb.database.exact_sums import exact_sum, whole
+from semdb.database.reading import Bad, keyframe_ids
 from semdb.database.tables import categories, cnn_vectors, keyframe_categories, keyframes, maps, recordings
 from semdb.types import Float32Array, Int64Array
 
 IN_CHUNK = 500
 FETCH = 50_000  # numbers at a time
 IDS_IN_A_ROW = 48  # at most 20 bytes each: servers cut a joined text off at 1024 bytes, unless told otherwise
+_LARGEST_ID = 2**63 // (MOST_OBJECTS + 1) ** 3 - 1  # that is packed with three numbers
 DENSE = 0.5  # of the ids of a range that are wanted: from here on the range is read, not a list of ids
 
 
-def iter_vectors(engine: Engine, map_id: int, chunk: int = 2000) -> Iterator[tuple[Int64Array, Float32Array]]:
+def iter_vectors(
+    engine: Engine, map_id: int, chunk: int = 2000, size: int | None = None, bad: Bad | None = None
+) -> Iterator[tuple[Int64Array, Float32Array]]:
     """All vectors of a map: ids int64 ``[n]``, ascending, and float32 ``[n, d]``, `chunk` at a time.
 
-    Each chunk is a transaction of its own, so a keyframe that is deleted meanwhile is left out. Raises CodecError.
+    Each chunk is a transaction of its own, so a keyframe that is deleted meanwhile is left out. `size` and `bad` as in
+    `vectors_there`; without `size` it is that of the first chunk.
     """
     ids = np.array(keyframe_ids(engine, map_id), np.int64)
     for start in range(0, len(ids), chunk):
-        yield vectors_there(engine, ids[start : start + chunk])
+        found, vectors = vectors_there(engine, ids[start : start + chunk], size, bad)
+        size = vectors.shape[1] if len(found) else size
+        yield found, vectors
 
 
-def vectors_there(engine: Engine, ids: Int64Array) -> tuple[Int64Array, Float32Array]:
-    """Vectors float32 ``[n, d]`` of those of `ids` that are there, and their ids, ascending. Raises CodecError."""
+def vectors_there(
+    engine: Engine, ids: Int64Array, size: int | None = None, bad: Bad | None = None
+) -> tuple[Int64Array, Float32Array]:
+    """Vectors float32 ``[n, d]`` of those of `ids` that are there, and their ids, ascending.
+
+    `size` is how many numbers they have to have, by default as many as most have. A damaged one is zero and told to
+    `bad`, or raises CodecError.
+    """
     wanted = np.unique(ids)
-    return _decoded(retry.read(engine, lambda connection: _rows(connection, wanted)))
+    return _decoded(retry.read(engine, lambda connection: _rows(connection, wanted)), size, bad)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,8 +63,8 @@ class CoarseRows:
     words: tuple[tuple[int, str, int], ...]  # keyframe, word (`semdb.class_score.word`), number, none of them 0
 
 
-def coarse_rows(engine: Engine, ids: Int64Array) -> CoarseRows:
-    """What is there of these keyframes, as of one moment. Raises CodecError."""
+def coarse_rows(engine: Engine, ids: Int64Array, size: int | None = None, bad: Bad | None = None) -> CoarseRows:
+    """What is there of these keyframes, as of one moment; `size` and `bad` as in `vectors_there`."""
     wanted = np.unique(ids)
 
     def work(connection: Connection) -> tuple[list[tuple[int, bytes]], list[tuple[int, str, int]]]:
@@ -58,16 +72,16 @@ def coarse_rows(engine: Engine, ids: Int64Array) -> CoarseRows:
         values = (c.count, c.upper_strength, c.lower_strength)
         query = select(c.keyframe_id, categories.c.name, *values).join(categories, categories.c.id == c.category_id)
         shown = [
-            (int(key), word(str(name), part), int(number))
+            (int(key), word(str(name), part), number)
             for keys in _in_chunks(wanted.tolist())
             for key, name, *numbers in connection.execute(query.where(c.keyframe_id.in_(keys)))
-            for part, number in zip(Part, numbers, strict=True)
+            for part, number in zip(Part, map(_held, numbers), strict=True)
             if number
         ]
         return _rows(connection, wanted), shown
 
     rows, shown = retry.read(engine, work)
-    found, vectors = _decoded(rows)
+    found, vectors = _decoded(rows, size, bad)
     there = set(found.tolist())
     return CoarseRows(found, vectors, tuple(item for item in shown if item[0] in there))
 
@@ -90,6 +104,7 @@ def category_columns(engine: Engine, map_id: int, category_id: int) -> tuple[Int
     packed = c.keyframe_id * base + _at_most(c.count)
     packed = (packed * base + _at_most(c.upper_strength)) * base + _at_most(c.lower_strength)
     query = select(packed.label("number")).where(c.map_id == map_id, c.category_id == category_id)
+    query = query.where(c.keyframe_id.between(0, _LARGEST_ID))
     query = query.order_by(c.keyframe_id).limit(FETCH)
     pieces = [np.empty(0, np.int64)]
     last = -1
@@ -120,7 +135,32 @@ def _numbers(connection: Connection, query: Select[tuple[int]], step: int) -> In
 
 
 def _at_most(column: ColumnElement[int]) -> ColumnElement[int]:
-    return case((column > MOST_OBJECTS, MOST_OBJECTS), else_=column)
+    """A number of objects, or a strength, as a mirror has it; 0 for what SQLite may have there that is none."""
+    return case(
+        (column.between(1, MOST_OBJECTS), cast(column, BigInteger)),
+        (column.between(MOST_OBJECTS, checked.LARGEST), MOST_OBJECTS),
+        else_=0,
+    )
+
+
+def _held(value: Any) -> int:
+    """As `_at_most`, of one value; larger ones stay."""
+    number = isinstance(value, int | float) and 1 <= value <= checked.LARGEST
+    return int(value) if number else 0
+
+
+def class_rows_that_are_none(engine: Engine, map_id: int, most: int) -> list[int]:
+    """Up to `most` keyframes of a map whose objects per class are no numbers, and count as none; on SQLite alone.
+
+    Servers keep only numbers there.
+    """
+    if engine.dialect.name != "sqlite":
+        return []
+    c = keyframe_categories.c
+    values = (c.count, c.upper_strength, c.lower_strength)
+    whole_number = and_(*(and_(func.typeof(value) == "integer", value.between(0, checked.LARGEST)) for value in values))
+    query = select(c.keyframe_id).where(c.map_id == map_id, not_(whole_number)).distinct().limit(most)
+    return [int(key) for key in retry.read(engine, lambda connection: list(connection.execute(query).scalars()))]
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,15 +176,16 @@ class MapSums:
 def map_sums(engine: Engine, map_id: int) -> MapSums:
     """The sums over a map; more than `MOST_OBJECTS` of a class count as so many. Reads two indexes to the end."""
     c = keyframe_categories.c
-    frames = select(func.count(), func.coalesce(func.sum(keyframes.c.id), 0))
+    frames = select(func.count(), *exact_sum(engine, keyframes.c.id))
     frames = frames.select_from(keyframes.join(recordings)).where(recordings.c.map_id == map_id)
     values = (c.count, c.upper_strength, c.lower_strength)
-    there = reduce(operator.add, (case((value > 0, 1), else_=0) for value in values))
+    there = reduce(operator.add, (case((value.between(1, checked.LARGEST), 1), else_=0) for value in values))
     numbers = reduce(operator.add, (_at_most(value) for value in values))
     shown = select(func.coalesce(func.sum(there), 0), func.coalesce(func.sum(numbers), 0)).where(c.map_id == map_id)
 
     def work(connection: Connection) -> MapSums:
-        return MapSums(*map(int, [*connection.execute(frames).one(), *connection.execute(shown).one()]))
+        number, *ids = connection.execute(frames).one()
+        return MapSums(int(number), whole(ids), *map(int, connection.execute(shown).one()))
 
     return retry.read(engine, work)
 
@@ -156,17 +197,17 @@ def map_identity(engine: Engine, map_id: int) -> str:
     return "" if row is None else f"{row.name} {row.created_at}"
 
 
-def _decoded(rows: list[tuple[int, bytes]]) -> tuple[Int64Array, Float32Array]:
+def _decoded(rows: list[tuple[int, bytes]], size: int | None, bad: Bad | None) -> tuple[Int64Array, Float32Array]:
     rows.sort(key=lambda row: row[0])
     found = np.array([row[0] for row in rows], np.int64)
-    return found, decode_vectors([row[1] for row in rows], "cnn_vectors of keyframe", found)
+    return found, decode_vectors([row[1] for row in rows], found, size, bad)
 
 
 def _rows(connection: Connection, ids: Int64Array) -> list[tuple[int, bytes]]:
     if not len(ids):
         return []
     c = cnn_vectors.c
-    query = select(c.keyframe_id, c.vector)
+    query = select(c.keyframe_id, checked.up_to(c.vector, checked.MOST_VECTOR))
     first, last = int(ids[0]), int(ids[-1])
     if len(ids) >= DENSE * (last - first + 1):
         keys = set(ids.tolist())

@@ -26,6 +26,8 @@ from semdb.database import (
 from semdb.database.engine import make_engine, parse_url, safe_url, sqlite_path
 from semdb.database.ids import SharedIds
 from semdb.database.items import Claim
+from semdb.database.left_out import MOST_SAID, LeftOut, once
+from semdb.database.reading import Bad
 from semdb.database.records import (
     Change,
     ChangeMark,
@@ -51,7 +53,7 @@ from semdb.database.records import (
 from semdb.database.sqlite_file import how_it_is_read
 from semdb.database.tables import maps, recordings
 from semdb.database.writing import KeyframeWriter
-from semdb.errors import NotFoundError, SchemaError
+from semdb.errors import CodecError, NotFoundError, SchemaError
 from semdb.types import BoolArray, Camera, Float32Array, FloatArray, Int64Array, Localization, ModelInfo
 
 Progress = Callable[[int, int], None]
@@ -60,9 +62,9 @@ Progress = Callable[[int, int], None]
 def open_store(url: str, *, create: bool = False, say: Callable[[str], None] | None = None) -> Store:
     """The store at `url`, its schema checked.
 
-    With `create` a SQLite file that is missing or empty is made; a server always needs `semdb init`. `say` takes a line
-    for people about a file that can only be read. Raises UsageError for a URL of another kind, DatabaseError when it
-    does not answer, SchemaError for a schema that is missing, older or newer.
+    With `create` a SQLite file that is missing or empty is made; a server always needs `semdb init`. `say` takes lines
+    for people about a file that can only be read, and about rows that are left out. Raises UsageError for a URL of
+    another kind, DatabaseError when it does not answer, SchemaError for a schema that is missing, older or newer.
     """
     parsed = parse_url(url)
     path = sqlite_path(parsed)
@@ -78,7 +80,7 @@ def open_store(url: str, *, create: bool = False, say: Callable[[str], None] | N
     except BaseException:
         engine.dispose()
         raise
-    return Store(engine)
+    return Store(engine, say)
 
 
 def _no_file(path: Path, url: str) -> str:
@@ -90,8 +92,11 @@ def _no_file(path: Path, url: str) -> str:
 class Store:
     """Reads and writes of a semantic database. Safe to share between threads; close it, or use it in a ``with``."""
 
-    def __init__(self, engine: Engine) -> None:
+    def __init__(self, engine: Engine, say: Callable[[str], None] | None = None) -> None:
+        """`say` takes lines for people about rows that are left out."""
         self.engine = engine
+        self.say = None if say is None else once(say)
+        self.left_out = LeftOut(say)  # for `bad` of what reads many keyframes
         self._ids = SharedIds(engine)
         self._writer = KeyframeWriter(engine, self._ids)
 
@@ -204,59 +209,97 @@ class Store:
         """Ids of all keyframes of a map, ascending."""
         return reading.keyframe_ids(self.engine, map_id)
 
+    def check_keyframes(self, keyframe_ids: Sequence[int]) -> None:
+        """Raises NotFoundError, naming it, for a keyframe that is not there; damaged ones are."""
+        reading.check_keyframes(self.engine, keyframe_ids)
+
     def load_vectors(self, keyframe_ids: Sequence[int]) -> Float32Array:
         """CNN vectors float32 ``[n, d]`` in the order of `keyframe_ids`. Raises NotFoundError, CodecError."""
         return reading.load_vectors(self.engine, keyframe_ids)
 
-    def vectors_there(self, keyframe_ids: Int64Array) -> tuple[Int64Array, Float32Array]:
-        """CNN vectors ``[n, d]`` of those keyframes that are there, and their ids, ascending. Raises CodecError."""
-        return scanning.vectors_there(self.engine, keyframe_ids)
+    def vectors_there(
+        self, keyframe_ids: Int64Array, size: int | None = None, bad: Bad | None = None
+    ) -> tuple[Int64Array, Float32Array]:
+        """CNN vectors ``[n, d]`` of those keyframes that are there, and their ids: see `scanning.vectors_there`."""
+        return scanning.vectors_there(self.engine, keyframe_ids, size, bad)
 
-    def load_keyframes(self, keyframe_ids: Sequence[int], *, descriptors: bool = True) -> list[StoredKeyframe]:
-        """Keyframes in the order of `keyframe_ids`. Raises NotFoundError, CodecError."""
-        return reading.load_keyframes(self.engine, keyframe_ids, with_descriptors=descriptors)
+    def load_keyframes(
+        self, keyframe_ids: Sequence[int], *, descriptors: bool = True, bad: Bad | None = None
+    ) -> list[StoredKeyframe]:
+        """Keyframes in the order of `keyframe_ids`. Raises NotFoundError; CodecError, or calls `bad` and leaves out."""
+        return reading.load_keyframes(self.engine, keyframe_ids, with_descriptors=descriptors, bad=bad)
 
     def keyframe_heads(
-        self, map_id: int, recording_id: int | None = None, *, after: int = 0, limit: int | None = None
+        self,
+        map_id: int,
+        recording_id: int | None = None,
+        *,
+        after: int = 0,
+        limit: int | None = None,
+        bad: Bad | None = None,
     ) -> list[KeyframeHead]:
-        """Keyframes of a map, or of a recording of it, without what is large, by ascending id, those after an id."""
-        return reading.keyframe_heads(self.engine, map_id=map_id, recording_id=recording_id, after=after, limit=limit)
+        """Keyframes of a map, or of a recording of it, without what is large, by ascending id, those after an id.
+
+        A damaged one raises CodecError, or is left out and told to `bad`.
+        """
+        return reading.keyframe_heads(
+            self.engine, map_id=map_id, recording_id=recording_id, after=after, limit=limit, bad=bad
+        )
 
     def keyframe_heads_of(self, keyframe_ids: Sequence[int]) -> list[KeyframeHead]:
         """These keyframes without what is large, by ascending id. Raises NotFoundError for one that is not there."""
         return reading.keyframe_heads(self.engine, keys=keyframe_ids)
 
     def load_image(self, keyframe_id: int) -> StoredImage:
-        """The colour and depth files of a keyframe as recorded. Raises NotFoundError."""
+        """The colour and depth files of a keyframe as recorded. Raises NotFoundError, CodecError."""
         return reading.load_image(self.engine, keyframe_id)
 
     def load_masks(self, keyframe_id: int) -> tuple[BoolArray, ...]:
         """Object masks ``[H, W]`` of a keyframe, by ordinal. Raises CodecError."""
         return reading.load_masks(self.engine, keyframe_id)
 
-    def poses(self, map_id: int, keyframe_ids: Sequence[int] | None = None) -> tuple[list[int], FloatArray]:
-        """Ids (ascending) and poses ``[n, 4, 4]`` of a map's keyframes: all, or those of `keyframe_ids`."""
-        return reading.poses(self.engine, map_id, keyframe_ids)
+    def poses(
+        self, map_id: int, keyframe_ids: Sequence[int] | None = None, bad: Bad | None = None
+    ) -> tuple[list[int], FloatArray]:
+        """Ids (ascending) and poses ``[n, 4, 4]`` of a map's keyframes: all, or those of `keyframe_ids`.
+
+        A pose that is none raises CodecError, or is left out and told to `bad`.
+        """
+        return reading.poses(self.engine, map_id, keyframe_ids, bad)
 
     def changes_since(self, map_id: int, change_id: int) -> list[Change]:
         """Changes of a map's keyframes after `change_id` (0: all), ascending."""
         return change_log.changes_since(self.engine, map_id, change_id)
 
+    def change_ids_since(self, map_id: int, change_id: int) -> list[int]:
+        """Ids of the changes after `change_id`, ascending, whatever they say."""
+        return change_log.change_ids_since(self.engine, map_id, change_id)
+
     def change_mark(self, map_id: int, change_id: int) -> ChangeMark:
         """What the log of changes holds after `change_id`, in three numbers: equal marks, nothing new."""
         return change_log.change_mark(self.engine, map_id, change_id)
 
-    def iter_vectors(self, map_id: int, chunk: int = 2000) -> Iterator[tuple[Int64Array, Float32Array]]:
-        """All vectors of a map in chunks: ids int64 ``[n]``, ascending, and vectors ``[n, d]``. Raises CodecError."""
-        return scanning.iter_vectors(self.engine, map_id, chunk)
+    def iter_vectors(
+        self, map_id: int, chunk: int = 2000, size: int | None = None, bad: Bad | None = None
+    ) -> Iterator[tuple[Int64Array, Float32Array]]:
+        """All vectors of a map in chunks: ids int64 ``[n]``, ascending, and ``[n, d]``: see `scanning.iter_vectors`."""
+        return scanning.iter_vectors(self.engine, map_id, chunk, size, bad)
 
     def change_text(self, map_id: int, change_id: int) -> str | None:
         """All that the log of changes says in one row; None where there is no such row."""
         return change_log.change_text(self.engine, map_id, change_id)
 
-    def coarse_rows(self, keyframe_ids: Int64Array) -> scanning.CoarseRows:
-        """Vectors and class counts of those keyframes that are there, as of one moment. Raises CodecError."""
-        return scanning.coarse_rows(self.engine, keyframe_ids)
+    def coarse_rows(
+        self, keyframe_ids: Int64Array, size: int | None = None, bad: Bad | None = None
+    ) -> scanning.CoarseRows:
+        """Vectors and class counts of those keyframes that are there, as of one moment: see `scanning.coarse_rows`."""
+        return scanning.coarse_rows(self.engine, keyframe_ids, size, bad)
+
+    def say_class_rows_that_are_none(self, map_id: int) -> None:
+        """Says which keyframes of a map have objects per class that are no numbers, and count as none."""
+        for key in scanning.class_rows_that_are_none(self.engine, map_id, MOST_SAID):
+            error = CodecError(f"keyframe_categories of keyframe {key}: its objects per class are no numbers")
+            self.left_out(key, error)
 
     def map_categories(self, map_id: int) -> list[tuple[int, str]]:
         """Ids and names of the classes that keyframes of a map show."""
@@ -279,8 +322,8 @@ class Store:
         return lookups.planned_frames(self.engine, map_name, recording)
 
     def cameras(self, map_id: int) -> list[Camera]:
-        """The different cameras of a map's keyframes."""
-        return lookups.map_cameras(self.engine, map_id)
+        """The different cameras of a map's keyframes; what is none is said, and left out, where somebody listens."""
+        return lookups.map_cameras(self.engine, map_id, self.say)
 
     def recording_camera(self, recording_id: int) -> tuple[Camera, float | None]:
         """Camera and depth scale of a recording. Raises NotFoundError without keyframes."""
@@ -297,12 +340,17 @@ class Store:
         return refinements.map_state(self.engine, map_id)
 
     def refinements(self, map_id: int | None = None) -> list[Refinement]:
-        """What `semdb refine` computed of a map, or of all, and whether the map is still the same."""
-        return refinements.list_refinements(self.engine, map_id)
+        """What `semdb refine` computed of a map, or of all, and whether the map is still the same.
 
-    def iter_objects(self, map_id: int, progress: Progress | None = None) -> Iterator[MapObject]:
+        Rows that are none are said, and left out, where somebody listens, or raise CodecError.
+        """
+        return refinements.list_refinements(self.engine, map_id, self.say)
+
+    def iter_objects(
+        self, map_id: int, progress: Progress | None = None, bad: Bad | None = None
+    ) -> Iterator[MapObject]:
         """All objects of a map that have a place in it, in an order that does not depend on ids."""
-        return refinements.iter_objects(self.engine, map_id, progress)
+        return refinements.iter_objects(self.engine, map_id, progress, bad)
 
     def replace_refinement(
         self,
@@ -319,16 +367,19 @@ class Store:
         )
 
     def class_confusions(self, map_id: int) -> list[ClassConfusion]:
-        """Which classes are taken for each other in a map, as of the last `semdb refine`."""
-        return refinements.load_confusions(self.engine, map_id)
+        """Which classes are taken for each other in a map, as of the last `semdb refine`.
+
+        Rows that are none are said, and left out, where somebody listens, or raise CodecError.
+        """
+        return refinements.load_confusions(self.engine, map_id, self.say)
 
     def listed_keyframes(self, map_id: int) -> list[ListedKeyframe]:
         """All keyframes of a map in an order that does not depend on ids."""
         return point_rows.listed_keyframes(self.engine, map_id)
 
-    def refined_points(self, keyframe_ids: Sequence[int]) -> dict[int, Float32Array]:
-        """Refined points ``[n, 4]`` of those keyframes that have any, as of the last `semdb refine`."""
-        return point_rows.load_points(self.engine, keyframe_ids)
+    def refined_points(self, keyframe_ids: Sequence[int], bad: Bad | None = None) -> dict[int, Float32Array]:
+        """Refined points ``[n, 4]`` of those keyframes that have any: see `point_rows.load_points`."""
+        return point_rows.load_points(self.engine, keyframe_ids, bad)
 
     # deletion and log
 

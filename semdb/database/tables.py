@@ -6,6 +6,7 @@ in docs/schema.md.
 
 from __future__ import annotations
 
+from datetime import datetime
 from typing import Any
 
 from sqlalchemy import (
@@ -21,6 +22,7 @@ from sqlalchemy import (
     String,
     Table,
     Text,
+    TypeDecorator,
     UniqueConstraint,
     func,
 )
@@ -36,9 +38,34 @@ NAMING = {
 }
 metadata = MetaData(naming_convention=NAMING)
 
+
+class _Bytes(LargeBinary):
+    """Blobs as the driver gives them: what SQLite may have in their columns is looked at where it is used."""
+
+    def result_processor(self, dialect: Any, coltype: Any) -> None:
+        return None
+
+
+class _Moment(TypeDecorator[Any]):
+    """Times; what is none comes as it is, and is looked at where it is used."""
+
+    impl = DateTime
+    cache_ok = True
+
+    def result_processor(self, dialect: Any, coltype: Any) -> Any:
+        return _as_moment if dialect.name == "sqlite" else None
+
+
+def _as_moment(value: Any) -> Any:
+    try:
+        return datetime.fromisoformat(value)
+    except (TypeError, ValueError):
+        return value
+
+
 # SQLite counts rows up only in a column of type INTEGER; MySQL's BLOB ends at 64 KiB, its TEXT too.
 Id = BigInteger().with_variant(Integer(), "sqlite")
-Blob = LargeBinary().with_variant(LONGBLOB(), "mysql", "mariadb")
+Blob = _Bytes().with_variant(LONGBLOB(), "mysql", "mariadb")
 LongText = Text().with_variant(LONGTEXT(), "mysql", "mariadb")
 STRENGTH_COLUMNS = ("upper_strength", "lower_strength", "keyframe_strength")
 
@@ -66,7 +93,7 @@ def _ref(name: str, target: str, *, cascade: bool = True, **options: Any) -> Col
 
 
 def _time(name: str) -> Column[Any]:
-    return Column(name, DateTime, nullable=False, server_default=func.current_timestamp())
+    return Column(name, _Moment, nullable=False, server_default=func.current_timestamp())
 
 
 maps = _table("maps", _id(), Column("name", String(NAME_LENGTH), nullable=False, unique=True), _time("created_at"))
@@ -99,7 +126,7 @@ recordings = _table(
     Column("frame_count", Integer, nullable=False),
     Column("state", String(16), nullable=False),
     _time("created_at"),
-    Column("finished_at", DateTime),
+    Column("finished_at", _Moment),
     UniqueConstraint("map_id", "name"),
 )
 
@@ -219,7 +246,7 @@ ingest_items = _table(
     Column("attempts", Integer, nullable=False),
     Column("error", Text),
     Column("worker", String(NAME_LENGTH)),
-    Column("lease_until", DateTime),
+    Column("lease_until", _Moment),
     Index(None, "state", "lease_until"),
     Index(None, "state", "recording_id", "frame_index"),
 )

@@ -20,7 +20,7 @@ from semdb.database.items import Claim, held_by
 from semdb.database.planning import check_models, map_model_ids
 from semdb.database.records import ChangeKind, ItemState, KeyframeRecord, RecordingState, WriteResult
 from semdb.errors import LeaseLostError, NotFoundError, UnstorableError, UsageError
-from semdb.geometry import quat_wxyz_from_rotation
+from semdb.geometry import FARTHEST_POSE_M, quat_wxyz_from_rotation
 from semdb.types import Description, FloatArray, ModelInfo
 
 _STATEMENT_OVERHEAD = 4096  # bytes of a statement beside its blobs
@@ -163,9 +163,11 @@ class KeyframeWriter:
 
 
 def pose_columns(world_from_camera: FloatArray) -> dict[str, float]:
-    """The columns qw, qx, qy, qz, tx, ty, tz of a pose ``[4, 4]``. Raises UsageError when it is not finite."""
+    """The columns qw, qx, qy, qz, tx, ty, tz of a pose ``[4, 4]``. Raises UsageError for what is none."""
     if world_from_camera.shape != (4, 4) or not np.isfinite(world_from_camera).all():
         raise UsageError("a keyframe needs a finite 4x4 pose")
+    if np.abs(world_from_camera[:3, 3]).max() > FARTHEST_POSE_M:
+        raise UsageError(f"a keyframe is at most {FARTHEST_POSE_M:g} m from the origin of its map")
     numbers = [*quat_wxyz_from_rotation(world_from_camera[:3, :3]), *world_from_camera[:3, 3]]
     return dict(zip(("qw", "qx", "qy", "qz", "tx", "ty", "tz"), map(float, numbers), strict=True))
 

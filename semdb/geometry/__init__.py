@@ -7,6 +7,7 @@ from semdb.geometry.projection import (
     project,
 )
 from semdb.geometry.se3 import (
+    FARTHEST_POSE_M,
     POSE_UNIT_DEG,
     POSE_UNIT_M,
     invert_pose,
@@ -26,6 +27,7 @@ from semdb.geometry.se3 import (
 )
 
 __all__ = [
+    "FARTHEST_POSE_M",
     "POSE_UNIT_DEG",
     "POSE_UNIT_M",
     "back_project",

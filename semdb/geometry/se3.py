@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from semdb.types import FloatArray
 
+FARTHEST_POSE_M = 1e8  # of a pose from the origin of its map: projections of the Earth have at most a fifth of it
 POSE_UNIT_M, POSE_UNIT_DEG = 0.3, 15.0  # so far apart two poses are at `pose_distances` of 1
 
 

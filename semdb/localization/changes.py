@@ -34,7 +34,7 @@ class ChangeReader:
     def skip(self) -> None:
         """What the log holds now counts as seen."""
         self.restore(self._store.change_mark(self._map_id, 0).newest, ())
-        self._note(self._store.changes_since(self._map_id, self._since()))
+        self._note(self._store.change_ids_since(self._map_id, self._since()))
 
     def read(self) -> list[Change] | None:
         """Changes that were not seen before, ascending; each is told once.
@@ -48,16 +48,16 @@ class ChangeReader:
             self.skip()
             return None
         new = [change for change in changes if change.id not in self.seen]
-        self._note(changes)
+        self._note([change.id for change in changes])
         return new
 
     def _since(self) -> int:
         return max(0, self.newest - self._overlap)
 
-    def _note(self, changes: Sequence[Change]) -> None:
-        self.newest = max([self.newest, *(change.id for change in changes)])
+    def _note(self, ids: Sequence[int]) -> None:
+        self.newest = max([self.newest, *ids])
         since = self._since()
-        self.seen = frozenset(change.id for change in changes if change.id > since)
+        self.seen = frozenset(number for number in ids if number > since)
         self._mark = ChangeMark(max(self.seen, default=0), len(self.seen), sum(self.seen))
 
 

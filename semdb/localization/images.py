@@ -38,7 +38,7 @@ def check_coarse(coarse: str) -> None:
 
 def make_localizer(
     store: Store,
-    info: MapInfo,
+    info: MapInfo | MapHead,
     coarse: str,
     options: LocalizerOptions | None = None,
     *,
@@ -65,6 +65,7 @@ def localizer_on(
     say: Callable[[str], None] | None = None,
 ) -> Localizer:
     """The localizer of one map whose coarse step asks `source`."""
+    store.say_class_rows_that_are_none(info.id)
     confusions: dict[str, dict[str, int]] = {}
     if say is not None and any(item.kind == CLASSES and not item.current for item in store.refinements(info.id)):
         say(f"map {info.name!r} has changed since semdb refine; the class confusions of then are used")

@@ -9,6 +9,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 
 from semdb.database.records import StoredKeyframe
 from semdb.database.refinements import POINTS
@@ -18,7 +19,7 @@ from semdb.geometry import POSE_UNIT_M, pose_distances
 from semdb.geometry.sensor import depth_noise
 from semdb.localization.coarse import MapChange
 from semdb.localization.views import ClassNumbers, KeyframeView, make_keyframe_view
-from semdb.recordings.images import decode_color_grey
+from semdb.recordings.images import decode_color_grey, has_size
 from semdb.types import Float32Array, FloatArray, ImageArray, Keypoints
 
 USED, STALE, NONE, OFF = "used", "stale", "none", "off"  # what becomes of its points
@@ -43,6 +44,7 @@ class KeyframeCache:
         self._stale: set[int] = set()  # keyframes whose poses are to be read again
         self._refined = refined
         self._points: str | None = None if refined else OFF
+        self.left_out: dict[int, CodecError] = {}  # keyframes that cannot be used
 
     @property
     def points(self) -> str:
@@ -66,22 +68,29 @@ class KeyframeCache:
         if change.everything:
             self._views.clear()
             self._names.clear()
+            self.left_out.clear()
             self._poses = None
             return
         for keyframe_id in change.gone:
+            self.left_out.pop(keyframe_id, None)
             self._views.pop(keyframe_id, None)
             self._names.pop(keyframe_id, None)
         if self._poses is not None:
             self._stale |= change.added | change.gone
 
-    def views(self, keyframe_ids: Sequence[int]) -> list[KeyframeView]:
-        """Views in the order of `keyframe_ids`; a keyframe deleted meanwhile is left out."""
+    def views(
+        self, keyframe_ids: Sequence[int], descriptors: npt.NDArray[np.generic] | None = None
+    ) -> list[KeyframeView]:
+        """Views in the order of `keyframe_ids`; a keyframe that was deleted meanwhile, or is damaged, is left out.
+
+        So is one that has not such `descriptors` ``[m, d]`` as it is to be compared with.
+        """
         with self._turn:
             self._load([i for i in keyframe_ids if i not in self._views])
             found = []
             for keyframe_id in keyframe_ids:
                 view = self._views.get(keyframe_id)
-                if view is not None:
+                if view is not None and self._is_comparable(view, descriptors):
                     self._views.move_to_end(keyframe_id)
                     found.append(view)
             while len(self._views) > self._capacity:
@@ -91,10 +100,14 @@ class KeyframeCache:
     def _load(self, missing: Sequence[int]) -> None:
         if not missing:
             return
-        refined = self._store.refined_points(missing) if self.points == USED else {}
+        refined = self._store.refined_points(missing, self._store.left_out) if self.points == USED else {}
         for stored in self._stored(missing):
             self._names[stored.id] = (stored.recording, stored.frame_index)
-            keypoints, looser = with_refined(stored.keypoints, refined.get(stored.id), stored.id)
+            try:
+                keypoints, looser = with_refined(stored.keypoints, refined.get(stored.id), stored.id)
+            except CodecError as error:
+                self._store.left_out(stored.id, error)
+                keypoints, looser = stored.keypoints, None
             self._views[stored.id] = make_keyframe_view(
                 stored.id,
                 stored.camera,
@@ -108,19 +121,39 @@ class KeyframeCache:
 
     def _stored(self, keyframe_ids: Sequence[int]) -> list[StoredKeyframe]:
         try:
-            return self._store.load_keyframes(keyframe_ids) if keyframe_ids else []
+            return self._store.load_keyframes(keyframe_ids, bad=self._leave_out) if keyframe_ids else []
         except NotFoundError:
             if len(keyframe_ids) == 1:
                 return []  # deleted since the coarse step proposed it
             return [found for keyframe_id in keyframe_ids for found in self._stored([keyframe_id])]
 
+    def _is_comparable(self, keyframe: KeyframeView, descriptors: npt.NDArray[np.generic] | None) -> bool:
+        own = keyframe.view.descriptors
+        if descriptors is None or (own.dtype == descriptors.dtype and own.shape[1] == descriptors.shape[1]):
+            return True
+        where = f"descriptors.data of keyframe {keyframe.keyframe_id}"
+        theirs = f"{descriptors.dtype} with {descriptors.shape[1]}"
+        error = CodecError(f"{where}: {own.dtype} with {own.shape[1]} numbers, and the query has {theirs}")
+        self._leave_out(keyframe.keyframe_id, error)
+        return False
+
+    def _leave_out(self, keyframe_id: int, error: CodecError) -> None:
+        self.left_out[keyframe_id] = error
+        self._store.left_out(keyframe_id, error)
+
     def _grey(self, stored: StoredKeyframe) -> ImageArray | None:
         """The keyframe's image in grey; None where it cannot be decoded or is not what the camera took."""
+        where = f"keyframe_images.rgb of keyframe {stored.id}"
         try:
-            grey = decode_color_grey(self._store.load_image(stored.id).rgb, f"keyframe {stored.id}")
-        except (NotFoundError, FrameError):  # deleted a moment ago, or damaged
+            data = self._store.load_image(stored.id).rgb
+            if not has_size(data, (stored.camera.width, stored.camera.height)):
+                return None
+            return decode_color_grey(data, where)
+        except NotFoundError:  # deleted a moment ago
             return None
-        return grey if grey.shape == (stored.camera.height, stored.camera.width) else None
+        except (FrameError, CodecError) as error:
+            self._store.left_out(stored.id, CodecError(str(error)))
+            return None
 
     def name_of(self, keyframe_id: int) -> tuple[str, int]:
         """Recording and frame index of a keyframe that was loaded."""
@@ -157,11 +190,11 @@ class KeyframeCache:
 
     def _read_poses(self) -> tuple[list[int], FloatArray]:
         if self._poses is None:
-            self._poses = self._store.poses(self._map_id)
+            self._poses = self._store.poses(self._map_id, bad=self._store.left_out)
         elif self._stale:
             ids = np.array(self._poses[0], np.int64)
             kept = ~np.isin(ids, list(self._stale))
-            new_ids, new_poses = self._store.poses(self._map_id, sorted(self._stale))
+            new_ids, new_poses = self._store.poses(self._map_id, sorted(self._stale), self._store.left_out)
             ids = np.concatenate([ids[kept], np.array(new_ids, np.int64)])
             order = np.argsort(ids, kind="stable")
             self._poses = ids[order].tolist(), np.concatenate([self._poses[1][kept], new_poses])[order]

@@ -104,7 +104,8 @@ class Localizer:
     def localize(self, description: Description) -> Localization:
         """The pose of `description` in the map.
 
-        Raises ProvenanceError when other models made the map, NotFoundError when the map holds no keyframe.
+        Raises ProvenanceError when other models made the map, NotFoundError when the map holds no keyframe, CodecError
+        where none that can be used is found among damaged ones.
         """
         search = _Search(self._view_of(description), self._check(description))
         source = _TimedSource(self.source)
@@ -166,12 +167,15 @@ class Localizer:
 
     def _match(self, search: _Search, keyframe_ids: Sequence[int]) -> None:
         started = time.perf_counter()
-        keyframes = self.cache.views(keyframe_ids)
+        keyframes = self.cache.views(keyframe_ids, search.query.descriptors)
         search.keyframes += keyframes
         search.matches += match_views(search.query, keyframes, self.options.pose)
         search.timing_ms["match"] += _ms_since(started)
 
     def _conclude(self, search: _Search) -> Localization:
+        damaged = [p.keyframe_id for p in search.proposals if p.keyframe_id in self.cache.left_out]
+        if damaged and not search.keyframes:
+            raise self.cache.left_out[damaged[0]]
         convinced = convinces(search.first, self.options.verdict) and search.stage != Stage.GIVEN
         if convinced:
             self._ask_neighbours(search)

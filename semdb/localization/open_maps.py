@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from semdb.database.planning import check_models
 from semdb.database.records import MapHead
 from semdb.database.store import Store
-from semdb.errors import NotFoundError, ProvenanceError, UsageError
+from semdb.errors import CodecError, ModelError, NotFoundError, ProvenanceError, UsageError
 from semdb.localization.coarse import CoarseSource
 from semdb.localization.images import ImageLocalization, check_coarse, localizer_on, open_index
 from semdb.localization.index import IndexSource, MapIndex
@@ -61,8 +61,9 @@ class OpenMaps:
     def asked(self, map_name: str | None, coarse: str) -> list[OpenMap]:
         """The map of that name, or all that hold keyframes, as they are now, with the coarse step ``sql`` or ``index``.
 
-        A map whose models are not at hand is an error when it is the only one, else it is left out aloud. Raises
-        NotFoundError for a map that is not there or empty, ProvenanceError for models that did not make it, UsageError.
+        A map whose models are not at hand, or whose rows are damaged, is an error when it is the only one, else it is
+        left out aloud. Raises NotFoundError for a map that is not there or empty, ProvenanceError for models that did
+        not make it, UsageError, CodecError.
         """
         check_coarse(coarse)
         heads = self._store.map_heads()
@@ -81,7 +82,7 @@ class OpenMaps:
         for head in wanted:
             try:
                 opened.append(self._as_it_is(head, coarse))
-            except (ProvenanceError, UsageError) as error:
+            except (ProvenanceError, UsageError, CodecError, ModelError) as error:
                 if len(wanted) == 1:
                     raise
                 refused.append(error)
@@ -116,6 +117,8 @@ class OpenMaps:
                 self._indexes = {key: entry for key, entry in self._indexes.items() if key in there}
 
     def _as_it_is(self, head: MapHead, coarse: str) -> OpenMap:
+        if head.damage:
+            raise CodecError(head.damage)
         known = self._open.get((head.id, coarse))
         if known is not None and known.head == head:
             return known
@@ -163,19 +166,28 @@ class OpenMaps:
         return index
 
 
-def ask(maps: Sequence[OpenMap], query: QueryImage) -> ImageLocalization:
+def ask(maps: Sequence[OpenMap], query: QueryImage, say: Callable[[str], None] | None = None) -> ImageLocalization:
     """The best answer of all `maps`; two maps that both know the place make it ambiguous.
 
-    Raises FrameError, ModelError, DatabaseError.
+    A map that is too damaged to answer is left out and told to `say` where another one answers. Raises FrameError,
+    ModelError, DatabaseError.
     """
     described: dict[Describer, Description] = {}
     answers: list[tuple[Description, Localization]] = []
+    refused: list[CodecError] = []
     for entry in maps:
         if entry.describer not in described:
             described[entry.describer] = entry.describer.describe(
                 query.image, query.depth, query.camera, query.instances
             )
-        answers.append((described[entry.describer], entry.localizer.localize(described[entry.describer])))
+        try:
+            answers.append((described[entry.describer], entry.localizer.localize(described[entry.describer])))
+        except CodecError as error:
+            refused.append(error)
+            if say is not None and len(maps) > 1:
+                say(f"map {entry.head.name!r} does not answer: {error}")
+    if not answers:
+        raise refused[0]
     order = {Verdict.LOCALIZED: 2, Verdict.AMBIGUOUS: 1, Verdict.FAILED: 0}
     answers.sort(key=lambda answer: (order[answer[1].verdict], answer[1].inliers), reverse=True)
     description, best = answers[0]

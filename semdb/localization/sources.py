@@ -55,7 +55,7 @@ class SqlSource:
         return Scored(ids, np.array([keyframe.class_score for keyframe in found], np.float64))
 
     def cosines(self, vector: Float32Array, keyframe_ids: Int64Array) -> FloatArray:
-        ids, vectors = self._store.vectors_there(keyframe_ids)
+        ids, vectors = self._store.vectors_there(keyframe_ids, len(vector), self._store.left_out)
         result = np.full(len(keyframe_ids), np.nan)
         if len(ids):
             place = np.minimum(np.searchsorted(ids, keyframe_ids), len(ids) - 1)
@@ -68,7 +68,7 @@ class SqlSource:
         shared = self.filtered(query, 0.0, None) if query is not None else Scored(np.empty(0, np.int64), np.empty(0))
         known = dict(zip(shared.keyframe_ids.tolist(), shared.class_scores.tolist(), strict=True))
         best = Ranked(np.empty(0, np.int64), np.empty(0), np.empty(0))
-        for ids, vectors in self._store.iter_vectors(self._map_id):
+        for ids, vectors in self._store.iter_vectors(self._map_id, size=len(vector), bad=self._store.left_out):
             scores = np.array([known.get(i, 0.0) for i in ids.tolist()])
             cosines = exact_cosines(vectors, np.arange(len(ids)), vector)
             both = Ranked(

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from semdb.errors import ModelError, UsageError
 from semdb.perception.catalogue import BY_NAME
@@ -74,8 +75,10 @@ def specs_for_query(settings: Settings, map_models: Sequence[ModelInfo]) -> Mode
         spec = str(getattr(settings, role))
         chosen[role] = _spec_of(known[role], settings) if spec == AUTO and role in known else spec
     if AUTO in chosen.values():
+        missing = ", ".join(role for role in ROLES if chosen[role] == AUTO)
         raise UsageError(
-            "the map holds no keyframe yet, so it cannot say which models to use: ingest a recording first"
+            f"the map does not say which {missing} made it: ingest a recording first where it holds no keyframe yet, "
+            f"or set SEMDB_{missing.split(', ')[0].upper()}"
         )
     return ModelSpecs(chosen["detector"], chosen["encoder"], chosen["features"])
 
@@ -86,9 +89,9 @@ def settings_of_map(settings: Settings, map_models: Sequence[ModelInfo]) -> Sett
     So a query, or a second recording, is described as the map was. What is set and differs stays: comparing the
     models then says so.
     """
-    taken = {}
+    taken: dict[str, Any] = {}
     for model in map_models:
-        config = json.loads(model.config)
+        config = _config(model)
         for name in ("score_threshold", "max_keypoints"):
             if name in config and name not in settings.model_fields_set:
                 taken[name] = config[name]
@@ -97,6 +100,40 @@ def settings_of_map(settings: Settings, map_models: Sequence[ModelInfo]) -> Sett
                 if name in config and name not in settings.model_fields_set:
                     taken[name] = ",".join(config[name])
     return settings.model_copy(update=taken)
+
+
+def _config(model: ModelInfo) -> dict[str, Any]:
+    """What of a configuration settings take. Raises ModelError for what no semdb wrote."""
+    try:
+        config = json.loads(model.config)
+    except (ValueError, RecursionError):
+        config = None
+    if not isinstance(config, dict):
+        shown = repr(model.config[:60])
+        raise ModelError(f"the configuration (models.config) of the {model.role} {model.name} is no object: {shown}")
+    for name, is_right in _RIGHT.items():
+        if name in config and not is_right(config[name]):
+            raise ModelError(
+                f"the configuration (models.config) of the {model.role} {model.name} has an impossible {name}: "
+                f"{json.dumps(config[name])[:60]}"
+            )
+    return config
+
+
+def _is_number(value: object, least: float, most: float) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and least <= value <= most
+
+
+def _are_names(value: object) -> bool:
+    return isinstance(value, list) and all(isinstance(name, str) for name in value)
+
+
+_RIGHT: dict[str, Callable[[object], bool]] = {
+    "score_threshold": lambda value: _is_number(value, 0, 1),
+    "max_keypoints": lambda value: isinstance(value, int) and _is_number(value, 1, 20_000),
+    "classes": _are_names,
+    "dynamic": _are_names,
+}
 
 
 def _spec_of(model: ModelInfo, settings: Settings) -> str:

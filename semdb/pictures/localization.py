@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from semdb.database.store import Store
+from semdb.errors import CodecError, FrameError
 from semdb.geometry import pose_error, transform_points
 from semdb.localization.query_image import QueryImage
 from semdb.pictures.drawing import category_colours, combine_pictures, draw_localization, localization_facts
 from semdb.pictures.top_view import MapObject, draw_top_view
 from semdb.recordings import decode_color
+from semdb.recordings.images import has_size
 from semdb.types import Detection, ImageArray, Localization
 
 
@@ -54,24 +54,35 @@ def _keyframe(store: Store, found: Localization) -> tuple[ImageArray | None, tup
     if found.best_keyframe_id is None:
         return None, (), ""
     stored = store.load_keyframes([found.best_keyframe_id], descriptors=False)[0]
-    masks = store.load_masks(stored.id)
-    detections = tuple(
-        Detection(thing.category, thing.score, thing.box, mask)
-        for thing, mask in zip(stored.objects, masks, strict=True)
-    )
-    image = decode_color(store.load_image(stored.id).rgb, f"keyframe {stored.id}")
-    return image, detections, f"best keyframe: {stored.recording}, frame {stored.frame_index}"
+    label = f"best keyframe: {stored.recording}, frame {stored.frame_index}"
+    try:
+        masks = store.load_masks(stored.id)
+        detections = tuple(
+            Detection(thing.category, thing.score, thing.box, mask)
+            for thing, mask in zip(stored.objects, masks, strict=True)
+        )
+    except CodecError as error:
+        store.left_out(stored.id, error)
+        detections = ()
+    try:
+        data = store.load_image(stored.id).rgb
+        where = f"keyframe_images.rgb of keyframe {stored.id}"
+        if not has_size(data, (stored.camera.width, stored.camera.height)):
+            raise CodecError(f"{where}: not of {stored.camera.width}x{stored.camera.height} pixels, as the camera is")
+        return decode_color(data, where), detections, label
+    except (CodecError, FrameError) as error:
+        store.left_out(stored.id, CodecError(str(error)))
+        return None, (), label
 
 
 def _top_view(store: Store, query: QueryImage, found: Localization, classes: Sequence[str]) -> ImageArray:
     info = store.find_map(found.map_name)
-    ids, poses = store.poses(info.id)
-    objects = []
-    for stored in store.load_keyframes(ids, descriptors=False):
-        for thing in stored.objects:
-            if np.isfinite(thing.geometry.centroid).all() and thing.score >= 0.7:
-                centre = transform_points(stored.world_from_camera, thing.geometry.centroid)
-                objects.append(MapObject(thing.category, centre))
+    ids, poses = store.poses(info.id, bad=store.left_out)
+    objects = [
+        MapObject(thing.category, transform_points(thing.world_from_camera, thing.centroid))
+        for thing in store.iter_objects(info.id, bad=store.left_out)
+        if thing.score >= 0.7
+    ]
     matched = {candidate.keyframe_id for candidate in found.candidates}
     return draw_top_view(
         poses,

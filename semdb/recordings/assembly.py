@@ -7,7 +7,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+
 from semdb.errors import FrameError, RecordingError, UsageError
+from semdb.geometry import FARTHEST_POSE_M
+from semdb.recordings.association import TOO_FAR
 from semdb.recordings.base import DroppedFrame, FrameData, FrameEntry, Recording
 from semdb.recordings.camera_files import CAMERA_FILE, find_camera_file
 from semdb.recordings.cameras import with_size
@@ -76,10 +80,14 @@ def finish(draft: Draft, camera: Camera | None) -> Recording:
     are not looked at: `known_camera` or `camera` must have their size.
     Raises RecordingError when no frame is left, or the images do not have the size of the camera.
     """
+    kept = []
     for entry in draft.entries:
-        if entry.index > HIGHEST_INDEX:
-            draft.dropped.append(DroppedFrame(entry.name, f"its number is too large: at most {HIGHEST_INDEX}"))
-    draft.entries = [entry for entry in draft.entries if entry.index <= HIGHEST_INDEX]
+        impossible = _impossible(entry)
+        if impossible:
+            draft.dropped.append(DroppedFrame(entry.name, impossible))
+        else:
+            kept.append(entry)
+    draft.entries = kept
     if draft.data is not None:
         return _finish_data(draft, camera)
     headers, unreadable = _inspect_images(draft.entries)
@@ -98,6 +106,16 @@ def finish(draft: Draft, camera: Camera | None) -> Recording:
         else:
             usable.append(entry)
     return _recording(draft, usable, chosen)
+
+
+def _impossible(entry: FrameEntry) -> str:
+    """Why the database would not take a frame; "" where it does."""
+    if entry.index > HIGHEST_INDEX:
+        return f"its number is too large: at most {HIGHEST_INDEX}"
+    pose = entry.world_from_camera
+    if pose is not None and not (np.abs(pose[:3, 3]) <= FARTHEST_POSE_M).all():
+        return f"its pose {TOO_FAR}"
+    return ""
 
 
 def _finish_data(draft: Draft, camera: Camera | None) -> Recording:

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from semdb.errors import RecordingError
 from semdb.files import UnusableFileError, fields_of, numbered_lines, parse_number, read_text, without_comment
 from semdb.geometry import (
+    FARTHEST_POSE_M,
     pose_from,
     quat_wxyz_from_rotation,
     rotation_from_quat_wxyz,
@@ -28,6 +29,7 @@ MAX_TIME_DIFFERENCE_NS = 20_000_000
 TURN_WINDOW_NS = 50_000_000
 ASSOCIATIONS = "associations.txt"
 LONGEST_TIME = 100  # characters
+TOO_FAR = f"is farther than {FARTHEST_POSE_M / 1000:.0f} km from the origin"
 NORM_TOLERANCE = 0.05  # data sets round quaternions to four digits; more than this is no rotation
 
 _TIME_AND_NAME = re.compile(r"([^\s,;]+(?:,\d+)?)(?:\s*[,;]\s*|\s+)(\S.*)")
@@ -165,6 +167,8 @@ def parse_pose(values: Sequence[str], quaternion: str | None = None) -> tuple[Fl
         norm = float(np.linalg.norm(quat_wxyz))
     if not abs(norm - 1) <= NORM_TOLERANCE:
         raise ValueError(f"is no rotation: the quaternion has length {norm:.3g} instead of 1")
+    if np.abs(numbers[:3]).max() > FARTHEST_POSE_M:
+        raise ValueError(TOO_FAR)
     return quat_wxyz / norm, numbers[:3]
 
 

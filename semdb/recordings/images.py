@@ -188,6 +188,15 @@ def decode_color_grey(data: bytes, name: str) -> ImageArray:
         raise FrameError(f"{name}: {error}") from error
 
 
+def has_size(data: bytes, size: tuple[int, int]) -> bool:
+    """Whether an image in memory is of this width and height, as its header has it; True where that cannot be told."""
+    try:
+        header = read_header(data)
+    except (NotAnImageError, ImageFileError):
+        return True  # whoever decodes it says what is wrong
+    return header.size == size
+
+
 def decode_16bit(data: bytes, name: str, size: tuple[int, int], what: str = "a depth image") -> npt.NDArray[np.uint16]:
     """The 16-bit values ``[H, W]`` of a PNG in memory; `size` is the expected (width, height).
 

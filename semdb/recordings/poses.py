@@ -10,12 +10,11 @@ import numpy.typing as npt
 
 from semdb.errors import RecordingError
 from semdb.files import fields_of, parse_number
-from semdb.geometry import pose_from, project_to_so3
-from semdb.recordings.association import BadLine, read_lines
+from semdb.geometry import FARTHEST_POSE_M, pose_from, project_to_so3
+from semdb.recordings.association import TOO_FAR, BadLine, read_lines
 from semdb.types import FloatArray
 
 ROTATION_TOLERANCE = 0.02  # matrices of real data sets are off by up to 4e-4
-FARTHEST_M = 1e6  # of the origin; beyond it is no place
 
 
 def rigid_pose(matrix: npt.ArrayLike) -> FloatArray:
@@ -35,8 +34,8 @@ def rigid_pose(matrix: npt.ArrayLike) -> FloatArray:
         off = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
     if not off <= ROTATION_TOLERANCE or np.linalg.det(rotation) <= 0:
         raise ValueError(f"is no rotation (R^T R differs from the identity by {off:.2g})")
-    if np.abs(m[:3, 3]).max() > FARTHEST_M:
-        raise ValueError("is farther than 1000 km from the origin")
+    if np.abs(m[:3, 3]).max() > FARTHEST_POSE_M:
+        raise ValueError(TOO_FAR)
     return pose_from(project_to_so3(rotation), m[:3, 3])
 
 

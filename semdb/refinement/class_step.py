@@ -29,7 +29,7 @@ class ClassStep:
         return asdict(self.options)
 
     def compute(self, store: Store, map_id: int, progress: Callable[[int, int], None]) -> list[ClassConfusion]:
-        placed, names = placed_objects(store.iter_objects(map_id, progress))
+        placed, names = placed_objects(store.iter_objects(map_id, progress, store.left_out))
         counts = co_detections(placed, len(names), self.options)
         return [
             ClassConfusion(names[found.category], names[found.other], found.pairs, found.weight)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -12,6 +13,7 @@ from sqlalchemy import Connection
 from semdb.database import point_rows, refinements
 from semdb.database.records import KeyframePoints
 from semdb.database.store import Store
+from semdb.errors import CodecError
 from semdb.localization.views import ClassNumbers, View, make_view
 from semdb.refinement.points.options import FusionOptions
 
@@ -35,16 +37,16 @@ class PointStep:
         from semdb.refinement.points.overlap import volume_of
         from semdb.refinement.points.refined import refine_points
 
-        ids = [listed.id for listed in store.listed_keyframes(map_id)]
-        numbers, volumes, counts = ClassNumbers(), [], []
-        for start in range(0, len(ids), READ_CHUNK):
-            for known in store.load_keyframes(ids[start : start + READ_CHUNK], descriptors=False):
-                keypoints = known.keypoints
-                volumes.append(
-                    volume_of(known.camera, known.world_from_camera, keypoints.features.xy, keypoints.points)
-                )
-                counts.append(len(keypoints))
-            progress(len(volumes), 2 * len(ids))
+        listed = [item.id for item in store.listed_keyframes(map_id)]
+        numbers, volumes, counts = ClassNumbers(), {}, {}
+        kinds: dict[int, tuple[str, int]] = {}  # of descriptors
+        for start in range(0, len(listed), READ_CHUNK):
+            for known in store.load_keyframes(listed[start : start + READ_CHUNK], bad=store.left_out):
+                xy, described = known.keypoints.features.xy, known.keypoints.features.descriptors
+                volumes[known.id] = volume_of(known.camera, known.world_from_camera, xy, known.keypoints.points)
+                counts[known.id], kinds[known.id] = len(xy), (str(described.dtype), described.shape[1])
+            progress(min(start + READ_CHUNK, len(listed)), 2 * len(listed))
+        ids = _comparable(listed, kinds, store)
 
         def load(number: int) -> View:
             (known,) = store.load_keyframes([ids[number]])
@@ -55,11 +57,24 @@ class PointStep:
             progress(total + done, 2 * total)
 
         results = []
-        for number, found in refine_points(volumes, load, self.options, show):
-            points = np.full((counts[number], 4), np.nan, np.float32)
+        for number, found in refine_points([volumes[key] for key in ids], load, self.options, show):
+            points = np.full((counts[ids[number]], 4), np.nan, np.float32)
             points[found.keypoints] = found.points
             results.append(KeyframePoints(ids[number], points, found.fused, found.triangulated))
         return results
 
     def write(self, connection: Connection, map_id: int, result: Sequence[KeyframePoints]) -> int:
         return point_rows.replace_points(connection, map_id, result)
+
+
+def _comparable(listed: Sequence[int], kinds: Mapping[int, tuple[str, int]], store: Store) -> list[int]:
+    """Those keyframes whose descriptors are of the kind that most have; the others are said."""
+    counts = Counter(kinds.values())
+    if not counts:
+        return []
+    usual = max(counts, key=lambda kind: (counts[kind], kind))
+    for key, kind in kinds.items():
+        if kind != usual:
+            where = f"descriptors.data of keyframe {key}"
+            store.left_out(key, CodecError(f"{where}: {kind[0]} with {kind[1]} numbers, and others have {usual}"))
+    return [key for key in listed if kinds.get(key) == usual]

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -136,9 +137,9 @@ def test_only_what_changed_is_read(store: Store, options: IndexOptions, monkeypa
     read: list[list[int]] = []
     rows = store.coarse_rows
 
-    def counted(keys: Int64Array) -> CoarseRows:
+    def counted(keys: Int64Array, **how: Any) -> CoarseRows:
         read.append(keys.tolist())
-        return rows(keys)
+        return rows(keys, **how)
 
     monkeypatch.setattr(store, "coarse_rows", counted)
     monkeypatch.setattr(store, "iter_vectors", lambda *_: pytest.fail("the whole map was read"))
@@ -255,7 +256,7 @@ def test_a_refresh_that_failed_is_made_up_for(store: Store, monkeypatch: pytest.
     added = fill(store, name="second", frame_indexes=range(2), seed=70)[2]
     redescribe(store, map_id, ids[1], 44)
 
-    def broken(_: object) -> None:
+    def broken(*_: object, **__: object) -> None:
         raise RuntimeError("the database went away")
 
     monkeypatch.setattr(store, "coarse_rows", broken)

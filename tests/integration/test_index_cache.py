@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -35,9 +36,9 @@ def open_again(
     read: list[int] = []
     iter_vectors = store.iter_vectors
 
-    def counted(*arguments: int) -> Iterator[tuple[Int64Array, Float32Array]]:
+    def counted(*arguments: int, **how: Any) -> Iterator[tuple[Int64Array, Float32Array]]:
         read.append(1)
-        return iter_vectors(*arguments)
+        return iter_vectors(*arguments, **how)
 
     store.iter_vectors = counted  # type: ignore[method-assign, assignment]
     try:

@@ -143,6 +143,8 @@ def test_bad_lines_of_the_lists(walk: Path) -> None:
         ("100.1 0 0 0 1 1 0 1", "is no rotation: the quaternion has length 1.73 instead of 1"),
         ("100.1 0 0 0 0 0 1", "needs tx ty tz qx qy qz qw, but has 6 numbers"),
         ("100.1 0 0 0 0 0 x 1", "has something that is no number"),
+        ("100.1 1e12 0 0 0 0 0 1", "is farther than 100000 km from the origin"),
+        ("100.1 0 0 -1e300 0 0 0 1", "is farther than 100000 km from the origin"),
     ],
 )
 def test_unusable_poses_are_left_out_and_noted(walk: Path, line: str, reason: str) -> None:
@@ -152,6 +154,27 @@ def test_unusable_poses_are_left_out_and_noted(walk: Path, line: str, reason: st
     assert recording.notes == (
         f"groundtruth.txt: 1 line(s) with unusable poses left out, the first is line 3: {reason}",
     )
+
+
+def test_places_of_projections_of_the_earth_are_usable(walk: Path) -> None:
+    lines = (walk / "groundtruth.txt").read_text().splitlines()
+    moved = [" ".join([line.split()[0], "500000.25", "9900000.5", "412", *line.split()[4:]]) for line in lines[1:]]
+    (walk / "groundtruth.txt").write_text("\n".join([lines[0], *moved]))
+    recording = open_recording(walk)
+    assert recording.dropped == ()
+    assert recording.entries[0].world_from_camera is not None
+    assert recording.entries[0].world_from_camera[:3, 3].tolist() == [500000.25, 9900000.5, 412.0]
+
+
+def test_no_reader_lets_an_absurd_pose_pass(walk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a layout makes of its files goes through one place, whatever it has looked at itself."""
+    monkeypatch.setattr("semdb.recordings.association.FARTHEST_POSE_M", np.inf)
+    line = (walk / "groundtruth.txt").read_text().splitlines()[2].split()
+    replace_line(walk / "groundtruth.txt", 3, " ".join([line[0], "-1e12", *line[2:]]))
+    recording = open_recording(walk)
+    assert [(frame.name, frame.reason) for frame in recording.dropped] == [
+        ("rgb/100.100000.png", "its pose is farther than 100000 km from the origin")
+    ]
 
 
 def test_ground_truth_unsorted_and_duplicate(walk: Path) -> None:

@@ -9,7 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from semdb.database.scanning import CoarseRows
 from semdb.database.store import Store
+from semdb.errors import CodecError
 from semdb.localization.changes import ChangeReader, summary_of
 from semdb.localization.coarse import MapChange
 from semdb.localization.index.cache_files import CacheError
@@ -17,6 +19,7 @@ from semdb.localization.index.cache_folder import CacheFolder
 from semdb.localization.index.loading import load_mirror, same_as_database
 from semdb.localization.index.mirror import IndexOptions, Mirror, reduced
 from semdb.localization.index.state import State
+from semdb.types import Int64Array
 
 Progress = Callable[[int, int], None]
 ATTEMPTS = 5  # to find a moment in which mirror and database can be compared
@@ -148,12 +151,21 @@ class MapIndex:
         self._mirror.remove(state, gone)
         wanted = np.setdiff1d(np.concatenate([added, gone]), known)
         for start in range(0, len(wanted), CHUNK):
-            rows = self.store.coarse_rows(wanted[start : start + CHUNK])
+            rows = self._rows(wanted[start : start + CHUNK], state.vectors.size)
             if len(rows.ids) and state.vectors.size not in (0, rows.vectors.shape[1]):
                 self._build("its keyframes are described by another encoder now", None)
                 return
             self._mirror.append(rows.ids, rows.vectors, rows.words)
         self._unsaved += len(gone) + len(wanted)
+
+    def _rows(self, wanted: Int64Array, size: int) -> CoarseRows:
+        """What is there of keyframes; vectors have `size` numbers where none says otherwise by being whole."""
+        try:
+            return self.store.coarse_rows(wanted, bad=self.store.left_out)
+        except CodecError:
+            if not size:
+                raise
+            return self.store.coarse_rows(wanted, size, self.store.left_out)
 
     def _agrees(self) -> bool:
         """Whether the mirror is as the database is; what is written while they are compared is taken in first."""
