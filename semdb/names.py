@@ -22,6 +22,14 @@ def written(name: str) -> str:
     return _SURROGATE.sub(lambda found: f"\\u{ord(found[0]):04x}", escaped)
 
 
+def storable(text: str) -> str:
+    r"""`text` as a database, JSON or a page holds it: each lone surrogate as ``\udcXX``. Twice is as once.
+
+    For what is a name of its own, not a path that is opened again: a real backslash stays as it is.
+    """
+    return text if text.isascii() else _SURROGATE.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+
+
 def path_text(written_name: str) -> str:
     """The name that `written` was given, for `Path`."""
     if "\\udc" not in written_name:

@@ -60,12 +60,14 @@ def for_legend(text: object, most: int | None = None) -> str:
     return f"\u200b{plain}" if plain.startswith("_") else plain  # a space without width
 
 
-def for_json(document: str) -> str:
+def for_json(document: str, *, ascii_only: bool = False) -> str:
     r"""A JSON document with what no terminal should get, or UTF-8 cannot hold, as JSON's own ``\uXXXX``: it means the
-    same. Newlines between its values stay.
+    same. Newlines between its values stay. `ascii_only` is for terminals that show no more.
     """
     if document.isascii():  # JSON escapes ASCII's control characters itself, but for DEL
         return document.replace("\x7f", "\\u007f")
+    if ascii_only:
+        return "".join(c if c == "\n" or " " <= c <= "~" else _utf16(c) for c in document)
     return "".join(c if c == "\n" or c.isprintable() else _utf16(c) for c in document)
 
 

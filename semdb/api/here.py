@@ -16,8 +16,8 @@ from semdb.settings import Settings
 
 if TYPE_CHECKING:
     from semdb.ingestion.run import Describers
+    from semdb.localization.on_disk import RecordingsOnDisk
     from semdb.localization.open_maps import OpenMaps
-    from semdb.localization.query_image import RecordingsOnDisk
 
 
 class Here:
@@ -64,7 +64,7 @@ class Here:
 
     def on_disk(self) -> RecordingsOnDisk:
         """The recordings on disk that images were seen in."""
-        from semdb.localization.query_image import RecordingsOnDisk
+        from semdb.localization.on_disk import RecordingsOnDisk
 
         with self._turn:
             if self._on_disk is None:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
@@ -16,8 +17,9 @@ from semdb.door.values import Answer
 from semdb.errors import DatabaseError, FrameError, NotFoundError, UsageError
 
 if TYPE_CHECKING:  # the rooms behind are entered when something is asked of them: they take a second to import
+    from semdb.localization.on_disk import LikeCamera
     from semdb.localization.open_maps import OpenMap
-    from semdb.localization.query_image import Depth, Image, LikeCamera, PathText, QueryImage, QueryReader
+    from semdb.localization.query_image import Depth, Image, PathText, QueryImage, QueryReader
     from semdb.recordings import FrameEntry, ReadOptions, Recording
     from semdb.recordings.arrays import CameraLike
     from semdb.types import Localization
@@ -129,7 +131,17 @@ class Localizing(Base):
             return reader.read(images[number], own, name, number if len(images) > 1 else None)
 
         items = (partial(read, number) for number in range(len(images)))
-        return self._answers(items, map, camera, like, coarse, depth_scale=depth_scale, log=log, unreadable=unreadable)
+        return self._answers(
+            items,
+            map,
+            camera,
+            like,
+            coarse,
+            depth_scale=depth_scale,
+            paths=[Path(image) for image in images if isinstance(image, str | PathLike)],
+            log=log,
+            unreadable=unreadable,
+        )
 
     def localize_recording(
         self,
@@ -198,6 +210,7 @@ class Localizing(Base):
         coarse: str,
         *,
         depth_scale: float | None = None,
+        paths: Sequence[Path] = (),
         log: bool,
         unreadable: Callable[[FrameError], None] | None,
     ) -> Iterator[Answer]:
@@ -214,6 +227,7 @@ class Localizing(Base):
             known=lambda: open_maps.cameras(maps),
             depth_scale=depth_scale,
             on_disk=self._here.on_disk(),
+            paths=paths,
             say=self._say,
         )
         for number, read in enumerate(items):
@@ -227,7 +241,7 @@ class Localizing(Base):
                 continue
             decode_ms = (time.perf_counter() - started) * 1000
             maps = open_maps.asked(map, coarse) if number else maps  # as they are now
-            found = ask(maps, query, self._say)
+            found = ask(maps, query, lambda entry: open_maps.cameras([entry]), self._say)
             timing = {"decode": decode_ms, **found.description.timing_ms, **found.localization.timing_ms}
             timing["total"] = (time.perf_counter() - started) * 1000
             found = replace(found, localization=replace(found.localization, timing_ms=timing))
@@ -237,7 +251,7 @@ class Localizing(Base):
 
     def _like(self, maps: Sequence[OpenMap], name: str) -> LikeCamera:
         """The camera of a recording that the database knows by name, or of one on disk."""
-        from semdb.localization.query_image import LikeCamera
+        from semdb.localization.on_disk import LikeCamera
 
         store = self._store()
         for entry in maps:
@@ -255,7 +269,7 @@ class Localizing(Base):
         map_id = next(entry.head.id for entry in maps if entry.head.name == localization.map_name)
         try:
             store.log_query(map_id, image, localization)
-        except DatabaseError as error:
+        except (DatabaseError, UnicodeError) as error:
             self._say(f"the answer for {image} is not in the log of queries: {error}")
 
 

@@ -11,6 +11,7 @@ from semdb.api.base import Base
 from semdb.database.records import FailedItem, MapInfo, RecordingStatus, Refinement
 from semdb.door.values import Keyframe, Rows
 from semdb.errors import NotFoundError, UsageError
+from semdb.names import storable
 
 if TYPE_CHECKING:
     from semdb.database.reporting import WorkerStatus
@@ -49,7 +50,7 @@ class Reading(Base):
     def recording(self, name: str, map: str | None = None) -> RecordingStatus:
         """The recording of that name. Raises NotFoundError, UsageError where several maps have one."""
         everything = self.recordings(map)
-        found = [recording for recording in everything if recording.name == name]
+        found = [recording for recording in everything if recording.name == storable(name)]
         if not found:
             names = ", ".join(sorted({recording.name for recording in everything})) or "none"
             raise NotFoundError(f"there is no recording {name!r} in {self.url}; recordings: {names}")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import importlib
+import io
 import os
 import re
 import sys
@@ -208,6 +209,13 @@ def root(
     """
 
 
+def write_whatever_it_is() -> None:
+    r"""No terminal of another encoding costs an answer: what it cannot show becomes ``\u53a8``."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.errors in ("strict", "surrogateescape"):
+            stream.reconfigure(errors="backslashreplace")
+
+
 def main() -> None:
     """Entry point of the `semdb` command."""
     if "_SEMDB_COMPLETE" in os.environ:  # a shell asks what fits where its cursor is
@@ -215,6 +223,7 @@ def main() -> None:
 
         print(answer(typer.main.get_command(app)))
         return
+    write_whatever_it_is()
     try:
         app(prog_name="semdb")
     except KeyboardInterrupt as error:  # before a command began

@@ -93,7 +93,7 @@ class JsonList:
 
     def add(self, value: Any) -> None:
         """Prints an item."""
-        text = "\n".join(f"  {line}" for line in _json(value).split("\n"))
+        text = "\n".join(f"  {line}" for line in _json(value, self._stream).split("\n"))
         self._stream.write((",\n" if self._begun else "[\n") + text)
         self._stream.flush()
         self._begun = True
@@ -111,11 +111,16 @@ class JsonList:
 def print_json(value: Any, stream: TextIO | None = None) -> None:
     """Print `value` as indented JSON with a newline at the end."""
     stream = stream or sys.stdout
-    stream.write(_json(value) + "\n")
+    stream.write(_json(value, stream) + "\n")
 
 
-def _json(value: Any) -> str:
-    return for_json(json.dumps(to_jsonable(value), indent=2, ensure_ascii=False, default=str))
+def _json(value: Any, stream: TextIO) -> str:
+    document = for_json(json.dumps(to_jsonable(value), indent=2, ensure_ascii=False, default=str))
+    try:
+        document.encode(stream.encoding or "utf-8")
+    except (LookupError, UnicodeEncodeError):  # a terminal of another encoding
+        return for_json(document, ascii_only=True)
+    return document
 
 
 def _print_json_array(values: Iterable[Any], stream: TextIO) -> None:
@@ -123,7 +128,7 @@ def _print_json_array(values: Iterable[Any], stream: TextIO) -> None:
     held: list[str] = []  # an error that comes with the first ones leaves stdout empty
     size, before = 0, "[\n"
     for value in values:
-        held.append(before + textwrap.indent(_json(value), "  "))
+        held.append(before + textwrap.indent(_json(value, stream), "  "))
         size, before = size + len(held[-1]), ",\n"
         if size > MOST_HELD:
             stream.writelines(held)

@@ -82,14 +82,14 @@ def check_lines(report: Report | None) -> list[str]:
 
 
 def decode_all(recording: Recording) -> None:
-    """Decode every usable frame; those that fail go to `recording.decode_failures`."""
+    """Decode every usable frame; those that fail go to `recording.decode_failures`, strange ones to its `remarks`."""
     from semdb.cli.progress import Progress
     from semdb.errors import FrameError
 
     with Progress(f"decoding {recording.name}") as progress:
         for done, entry in enumerate(recording.entries, 1):
             try:
-                recording.read(entry)
+                recording.note_remarks(recording.read(entry))
             except FrameError as error:
                 recording.note_decode_failure(entry, error)
             progress.update(done, len(recording.entries))
@@ -122,6 +122,7 @@ def as_json(recording: Recording, quick: bool, report: Report | None = None) -> 
             {"name": dropped.name, "reason": dropped.reason}
             for dropped in (*recording.dropped, *recording.decode_failures)
         ],
+        "remarks": [{"name": remark.name, "remark": remark.reason} for remark in recording.remarks],
         "camera": {
             "model": camera.model,
             "width": camera.width,
@@ -166,6 +167,7 @@ def as_lines(recording: Recording, quick: bool) -> list[str]:
         ("frames", f"{found['frames']}, usable {found['usable']} ({triples})"),
         ("dropped", f"{len(dropped)}{' (images were not decoded: --quick)' if quick else ''}"),
         *(("", line) for line in group_dropped(dropped)),
+        *(("look at", line) for line in group_dropped(recording.remarks)),
         ("camera", describe_camera(recording.camera)),
         ("depth scale", f"{number(recording.depth_scale)} per metre{registered}"),
         ("masks", f"{found['with_masks']} frames" if found["with_masks"] else "none"),

@@ -54,6 +54,7 @@ from semdb.database.sqlite_file import how_it_is_read
 from semdb.database.tables import maps, recordings
 from semdb.database.writing import KeyframeWriter
 from semdb.errors import CodecError, NotFoundError, SchemaError
+from semdb.names import storable
 from semdb.types import BoolArray, Camera, Float32Array, FloatArray, Int64Array, Localization, ModelInfo
 
 Progress = Callable[[int, int], None]
@@ -132,7 +133,7 @@ class Store:
         """The map `name`. Raises NotFoundError, which names the maps there are."""
         known = self.maps()
         for info in known:
-            if info.name == name:
+            if info.name == storable(name):
                 return info
         names = ", ".join(info.name for info in known) or "none yet, run `semdb ingest` first"
         raise NotFoundError(f"there is no map {name!r} in {self.url}; maps: {names}")

@@ -27,7 +27,9 @@ from sqlalchemy import (
     func,
 )
 from sqlalchemy.dialects.mysql import LONGBLOB, LONGTEXT
+from sqlalchemy.engine import Dialect
 
+from semdb.names import storable
 from semdb.storable_names import NAME_LENGTH
 
 NAMING = {
@@ -66,6 +68,29 @@ def _as_moment(value: Any) -> Any:
 # SQLite counts rows up only in a column of type INTEGER; MySQL's BLOB ends at 64 KiB, its TEXT too.
 Id = BigInteger().with_variant(Integer(), "sqlite")
 Blob = _Bytes().with_variant(LONGBLOB(), "mysql", "mariadb")
+
+
+class Name(TypeDecorator[str]):
+    """Text from outside, of at most so many characters where it has a length.
+
+    File names on Linux are bytes, and Python reads those that are no UTF-8 as lone surrogates, which no server takes.
+    """
+
+    impl = String
+    cache_ok = True
+
+    def process_bind_param(self, value: str | None, dialect: Dialect) -> str | None:
+        """What is sent to the server."""
+        return value if value is None else storable(value)
+
+
+class Words(Name):
+    """As `Name`, of any length."""
+
+    impl = Text
+    cache_ok = True
+
+
 LongText = Text().with_variant(LONGTEXT(), "mysql", "mariadb")
 STRENGTH_COLUMNS = ("upper_strength", "lower_strength", "keyframe_strength")
 
@@ -96,7 +121,7 @@ def _time(name: str) -> Column[Any]:
     return Column(name, _Moment, nullable=False, server_default=func.current_timestamp())
 
 
-maps = _table("maps", _id(), Column("name", String(NAME_LENGTH), nullable=False, unique=True), _time("created_at"))
+maps = _table("maps", _id(), Column("name", Name(NAME_LENGTH), nullable=False, unique=True), _time("created_at"))
 
 models = _table(
     "models",
@@ -119,9 +144,9 @@ recordings = _table(
     "recordings",
     _id(),
     _ref("map_id", "maps.id"),
-    Column("name", String(NAME_LENGTH), nullable=False),
+    Column("name", Name(NAME_LENGTH), nullable=False),
     Column("format", String(32), nullable=False),
-    Column("source", Text, nullable=False),
+    Column("source", Words, nullable=False),
     Column("fingerprint", String(64), nullable=False),
     Column("frame_count", Integer, nullable=False),
     Column("state", String(16), nullable=False),
@@ -244,7 +269,7 @@ ingest_items = _table(
     Column("frame_index", Integer, primary_key=True, autoincrement=False),
     Column("state", String(16), nullable=False),
     Column("attempts", Integer, nullable=False),
-    Column("error", Text),
+    Column("error", Words),
     Column("worker", String(NAME_LENGTH)),
     Column("lease_until", _Moment),
     Index(None, "state", "lease_until"),
@@ -266,13 +291,13 @@ queries = _table(
     _id(),
     _ref("map_id", "maps.id"),
     _time("created_at"),
-    Column("image", Text, nullable=False),
+    Column("image", Words, nullable=False),
     Column("verdict", String(16), nullable=False),
     *(Column(name, Double) for name in ("qw", "qx", "qy", "qz", "tx", "ty", "tz")),
     Column("confidence", Double, nullable=False),
     Column("inliers", Integer, nullable=False),
     Column("stage", String(16), nullable=False),
-    Column("reason", Text, nullable=False),
+    Column("reason", Words, nullable=False),
     Column("candidates", LongText, nullable=False),
     Column("timing_ms", LongText, nullable=False),
     Index(None, "map_id", "created_at"),

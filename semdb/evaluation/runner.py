@@ -201,7 +201,7 @@ def _answer(
     shown: list[dict[tuple[str, int], Shown]] = [{} for _ in runs]
     objects: dict[tuple[str, int], list[PackedDetection]] = {}
     label = f"localizing in {task.name}" + (" with refined poses" if task.truth == REFINED else "")
-    for done, (name, frame, decode_ms) in enumerate(read_frames(task.queries), start=1):
+    for done, (name, frame, decode_ms) in enumerate(read_frames(task.queries, task.map_cameras), start=1):
         described: Described = {}
         key = name, frame.index
         for run, found, kept in zip(runs, answers, shown, strict=True):

@@ -18,10 +18,11 @@ from semdb.evaluation.tasks import Part, Task
 from semdb.ingestion.run import IngestOptions, ingest_recording
 from semdb.localization.images import make_localizer
 from semdb.localization.localizer import Localizer
+from semdb.localization.query_image import frame_at_scale
 from semdb.perception.describe import Describer, describer_from_specs
 from semdb.refinement.run import refine_map
 from semdb.settings import Settings
-from semdb.types import Description, Detection, FloatArray, Frame, Localization, ModelInfo
+from semdb.types import Camera, Description, Detection, FloatArray, Frame, Localization, ModelInfo
 
 Progress = Callable[[str, int, int], None]
 Described = dict[tuple[int, bool], tuple[Description, float]]  # by describer and whether depth was given
@@ -47,13 +48,16 @@ class Describers:
         return self._made[name]
 
 
-def read_frames(parts: Sequence[Part]) -> Iterator[tuple[str, Frame, float]]:
-    """Name of the recording, frame, decoding time in ms; what cannot be decoded is in `recording.decode_failures`."""
+def read_frames(parts: Sequence[Part], known: Sequence[Camera] = ()) -> Iterator[tuple[str, Frame, float]]:
+    """Name of the recording, frame, decoding time in ms; what cannot be decoded is in `recording.decode_failures`.
+
+    Frames that are larger than the images of the cameras `known` come at their scale, as queries of `semdb localize`.
+    """
     for part in parts:
         for entry in part.entries:
             started = time.perf_counter()
             try:
-                frame = part.recording.read(entry)
+                frame = frame_at_scale(part.recording.read(entry), known)
             except FrameError as error:
                 part.recording.note_decode_failure(entry, error)
                 continue

@@ -59,6 +59,11 @@ class Task:
         return list(dict.fromkeys(part.recording for part in (*self.keyframes, *self.queries)))
 
     @property
+    def map_cameras(self) -> list[Camera]:
+        """What took the keyframes."""
+        return list(dict.fromkeys(p.recording.camera_of(entry) for p in self.keyframes for entry in p.entries))
+
+    @property
     def query_count(self) -> int:
         return sum(len(part.entries) for part in self.queries)
 

@@ -16,6 +16,7 @@ from semdb.evaluation.failures import explain, median_sharpness
 from semdb.evaluation.metrics import EvaluationResult, QueryResult
 from semdb.evaluation.runs import Run
 from semdb.evaluation.tasks import Task
+from semdb.localization.query_scale import smaller_camera, smaller_image, times_finer
 from semdb.pictures.drawing import draw_localization
 from semdb.shown import measure
 from semdb.types import Detection, Float32Array, ImageArray, Localization
@@ -149,6 +150,7 @@ class _Images:
 
     def __init__(self, task: Task) -> None:
         self._recordings = {recording.name: recording for recording in task.recordings}
+        self._known = task.map_cameras
         self._entries = {
             (recording.name, entry.index): entry for recording in task.recordings for entry in recording.entries
         }
@@ -158,9 +160,12 @@ class _Images:
         if entry is None:
             return None
         try:
-            return self._recordings[name].read_image(entry)
+            camera = self._recordings[name].camera_of(entry)
+            image = self._recordings[name].read_image(entry)
         except FrameError:
             return None
+        times = times_finer(camera, self._known)  # as it was asked
+        return image if times == 1 else smaller_image(image, smaller_camera(camera, times))
 
 
 def _jpeg(image: ImageArray) -> bytes:

@@ -23,6 +23,7 @@ from semdb.errors import UsageError
 from semdb.ingestion.contradictions import check_before_ingest
 from semdb.ingestion.keyframes import select_keyframes
 from semdb.ingestion.work import STAGES, Item, log_item, work_off
+from semdb.names import storable
 from semdb.perception.describe import Describer, describer_from_specs
 from semdb.perception.model_choice import ModelSpecs, settings_of_map, specs_for_ingest
 from semdb.recordings import open_recordings, parse_camera
@@ -58,7 +59,7 @@ class IngestOptions:
 
     def map_of(self, recording: Recording) -> str:
         """The map that `recording` goes into."""
-        return default_map_name(recording) if self.map_name is None else self.map_name
+        return storable(default_map_name(recording) if self.map_name is None else self.map_name)
 
 
 @dataclass(slots=True)
@@ -86,6 +87,7 @@ class IngestSummary:
     blank: list[int] = field(default_factory=list)
     failed: dict[int, str] = field(default_factory=dict)
     dropped: tuple[DroppedFrame, ...] = ()
+    remarks: list[DroppedFrame] = field(default_factory=list)  # keyframes that show next to nothing
     notes: tuple[str, ...] = ()
     findings: tuple[RecordingFinding, ...] = ()
     seconds: dict[str, float] = field(default_factory=dict)
@@ -202,7 +204,7 @@ def open_all(paths: Sequence[Path | str], settings: Settings, options: IngestOpt
     if options.name is not None:
         if len(recordings) > 1:
             raise UsageError(f"--name names one recording, but {len(recordings)} were found")
-        recordings[0].name = options.name
+        recordings[0].name = storable(options.name)
     _check_names(recordings, options)
     return recordings
 
@@ -296,6 +298,7 @@ def plan_ingest(
 def _count(summary: IngestSummary, item: Item) -> None:
     for stage, seconds in item.seconds.items():
         summary.seconds[stage] += seconds
+    summary.remarks += [DroppedFrame(item.name, remark) for remark in item.remarks]
     if item.created:
         summary.stored += 1
         summary.objects += item.objects
@@ -330,7 +333,7 @@ def fingerprint(recording: Recording, keyframes: Sequence[FrameEntry]) -> str:
     """
     digest = hashlib.sha256(f"{recording.format}|{recording.camera}|{recording.depth_scale}".encode())
     for entry in keyframes:
-        digest.update(f"|{entry.index}|{entry.name}|{entry.timestamp_ns}".encode())
+        digest.update(f"|{entry.index}|{entry.name}|{entry.timestamp_ns}".encode(errors="surrogateescape"))
         if entry.camera is not None:
             digest.update(f"|{entry.camera}".encode())
         if entry.world_from_camera is not None:

@@ -37,7 +37,7 @@ from semdb.errors import (
 from semdb.events import event
 from semdb.ingestion.pipeline import Stage, overlapped
 from semdb.perception.describe import Describer, View
-from semdb.recordings.base import FrameEntry, Recording
+from semdb.recordings.base import FrameEntry, Recording, remarks_on
 from semdb.types import Description, Frame, InstanceMasks
 
 STAGES = ("read", "detect", "encode", "features", "store")
@@ -57,6 +57,8 @@ class Item:
     objects: int = 0
     keypoints: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
+    name: str = ""  # of the frame, once it is read
+    remarks: tuple[str, ...] = ()  # what people should know of it
 
     @property
     def outcome(self) -> str:
@@ -205,6 +207,7 @@ def _read(recording: Recording, item: Item) -> Item:
         return item
     try:
         item.frame = recording.read(item.entry)
+        item.name, item.remarks = item.frame.name, tuple(remarks_on(item.frame))
     except FrameError as error:
         if not recording.path.exists():
             raise RecordingUnavailableError(

@@ -14,9 +14,11 @@ from semdb.localization.coarse import CoarseSource
 from semdb.localization.images import ImageLocalization, check_coarse, localizer_on, open_index
 from semdb.localization.index import IndexSource, MapIndex
 from semdb.localization.localizer import Localizer, LocalizerOptions
-from semdb.localization.query_image import QueryImage
+from semdb.localization.query_image import QueryImage, at_scale
+from semdb.localization.query_scale import times_finer
 from semdb.localization.shared import SharedSource
 from semdb.localization.sources import SqlSource
+from semdb.names import storable
 from semdb.perception.describe import Describer, describer_from_specs
 from semdb.perception.model_choice import settings_of_map, specs_for_query
 from semdb.settings import Settings
@@ -69,7 +71,7 @@ class OpenMaps:
         heads = self._store.map_heads()
         self._drop_deleted(heads)
         if map_name is not None:
-            wanted = [head for head in heads if head.name == map_name]
+            wanted = [head for head in heads if head.name == storable(map_name)]
             if not wanted:
                 self._store.find_map(map_name)  # says which there are
         else:
@@ -166,22 +168,29 @@ class OpenMaps:
         return index
 
 
-def ask(maps: Sequence[OpenMap], query: QueryImage, say: Callable[[str], None] | None = None) -> ImageLocalization:
+def ask(
+    maps: Sequence[OpenMap],
+    query: QueryImage,
+    cameras: Callable[[OpenMap], Sequence[Camera]] | None = None,
+    say: Callable[[str], None] | None = None,
+) -> ImageLocalization:
     """The best answer of all `maps`; two maps that both know the place make it ambiguous.
 
-    A map that is too damaged to answer is left out and told to `say` where another one answers. Raises FrameError,
-    ModelError, DatabaseError.
+    `query` is no finer than the finest of them; of several, `cameras` says what took the images of each, so that each
+    is asked at its own scale. A map that is too damaged to answer is left out and told to `say` where another one
+    answers. Raises FrameError, ModelError, DatabaseError.
     """
-    described: dict[Describer, Description] = {}
-    answers: list[tuple[Description, Localization]] = []
+    described: dict[tuple[Describer, Camera], Description] = {}
+    answers: list[tuple[QueryImage, Description, Localization]] = []
     refused: list[CodecError] = []
     for entry in maps:
-        if entry.describer not in described:
-            described[entry.describer] = entry.describer.describe(
-                query.image, query.depth, query.camera, query.instances
-            )
+        known = cameras(entry) if cameras is not None and len(maps) > 1 else ()
+        scaled = at_scale(query, times_finer(query.camera, known))
+        key = entry.describer, scaled.camera
+        if key not in described:
+            described[key] = entry.describer.describe(scaled.image, scaled.depth, scaled.camera, scaled.instances)
         try:
-            answers.append((described[entry.describer], entry.localizer.localize(described[entry.describer])))
+            answers.append((scaled, described[key], entry.localizer.localize(described[key])))
         except CodecError as error:
             refused.append(error)
             if say is not None and len(maps) > 1:
@@ -189,10 +198,10 @@ def ask(maps: Sequence[OpenMap], query: QueryImage, say: Callable[[str], None] |
     if not answers:
         raise refused[0]
     order = {Verdict.LOCALIZED: 2, Verdict.AMBIGUOUS: 1, Verdict.FAILED: 0}
-    answers.sort(key=lambda answer: (order[answer[1].verdict], answer[1].inliers), reverse=True)
-    description, best = answers[0]
+    answers.sort(key=lambda answer: (order[answer[2].verdict], answer[2].inliers), reverse=True)
+    query, description, best = answers[0]
     limit = maps[0].localizer.options.verdict.rival_share * best.inliers
-    rivals = [other for _, other in answers[1:] if other.verdict is Verdict.LOCALIZED and other.inliers > limit]
+    rivals = [other for _, _, other in answers[1:] if other.verdict is Verdict.LOCALIZED and other.inliers > limit]
     if best.verdict is Verdict.LOCALIZED and rivals:
         reason = f"map {rivals[0].map_name!r} fits as well: {rivals[0].inliers} against {best.inliers} inliers"
         confidence = min(best.confidence, RIVAL_CONFIDENCE)

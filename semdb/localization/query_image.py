@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import threading
-from collections import OrderedDict
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -13,11 +12,22 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semdb.errors import FrameError, RecordingError, UsageError
-from semdb.recordings import decode_color, decode_depth, open_recordings, read_depth_image, read_query_image
+from semdb.errors import FrameError, UsageError
+from semdb.localization.on_disk import LikeCamera, RecordingsOnDisk
+from semdb.localization.query_scale import (
+    reduced_camera,
+    reduction_of,
+    smaller_camera,
+    smaller_image,
+    smaller_values,
+    times_finer,
+)
+from semdb.recordings import decode_color, decode_depth, read_depth_image
 from semdb.recordings.arrays import as_depth, as_image, check_depth_scale
 from semdb.recordings.base import FrameEntry, Recording
 from semdb.recordings.cameras import with_size
+from semdb.recordings.images import header_of, orientation_of, read_bytes, remark_on_color, remark_on_depth
+from semdb.recordings.intrinsics import camera_doubts, camera_problem, depth_scale_problem
 from semdb.recordings.memory import check_frame
 from semdb.types import Camera, Float32Array, FloatArray, Frame, ImageArray, InstanceMasks
 
@@ -25,7 +35,6 @@ Say = Callable[[str], None]
 PathText = str | PathLike[str]
 Image = PathText | bytes | npt.NDArray[Any] | Frame  # bytes are those of a file
 Depth = PathText | bytes | npt.NDArray[Any]
-KEPT = 16  # recordings whose lists of frames are remembered
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,60 +55,15 @@ class QueryImage:
     timestamp_ns: int | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class LikeCamera:
-    """A camera to take for images without one, its depth scale, and where it comes from."""
-
-    camera: Camera
-    depth_scale: float | None
-    origin: str
-
-
-class RecordingsOnDisk:
-    """The recordings that images lie in, each opened once, and again when its folders have changed. Thread-safe."""
-
-    def __init__(self) -> None:
-        self._turn = threading.Lock()
-        self._kept: OrderedDict[Path, tuple[object, tuple[Recording, dict[Path, FrameEntry]] | None]] = OrderedDict()
-        self._like: tuple[object, LikeCamera] | None = None
-
-    def around(self, path: Path) -> tuple[Recording, FrameEntry] | None:
-        """The recording around an image (its folder, or the one above) and the image's entry in it."""
-        absolute = path.resolve()
-        for folder in (absolute.parent, absolute.parent.parent):
-            found = self._open(folder, (_changed(folder), _changed(absolute.parent)))
-            if found is not None and absolute in found[1]:
-                return found[0], found[1][absolute]
-        return None
-
-    def camera_like(self, path: Path) -> LikeCamera:
-        """The camera of the recording at `path`, of the first one where there are several. Raises RecordingError."""
-        state = path, _changed(path)
-        with self._turn:
-            if self._like is None or self._like[0] != state:
-                recording = open_recordings(path)[0]
-                self._like = state, LikeCamera(recording.camera, recording.depth_scale, str(recording.path))
-            return self._like[1]
-
-    def _open(self, folder: Path, state: object) -> tuple[Recording, dict[Path, FrameEntry]] | None:
-        with self._turn:
-            known = self._kept.get(folder)
-            if known is None or known[0] != state:
-                known = self._kept[folder] = state, _open_or_none(folder)
-            self._kept.move_to_end(folder)
-            while len(self._kept) > KEPT:
-                self._kept.popitem(last=False)
-            return known[1]
-
-
 class QueryReader:
     """Makes query images of files, arrays and frames.
 
     The camera is, in this order, `camera` (from ``--camera``), that of a frame, that of `like` (from ``--like``), that
     of the recording on disk that the image belongs to, `known` when all the map's keyframes have one camera of that
     size. Depth has `depth_scale` units per metre, or those of `like`, or of the recording; floats in memory are metres.
-    With `nominal` an image without depth whose camera is not known gets that of a usual lens, for where nothing is
-    measured.
+    An image that is larger than the map's, and finer, comes at their scale (see `query_scale`). `paths` are the files
+    that will be read, where they are known before. With `nominal` an image without depth whose camera is not known gets
+    that of a usual lens, for where nothing is measured.
     """
 
     def __init__(
@@ -110,6 +74,7 @@ class QueryReader:
         known: Callable[[], Sequence[Camera]] = tuple,
         depth_scale: float | None = None,
         on_disk: RecordingsOnDisk | None = None,
+        paths: Collection[Path] = (),
         say: Say | None = None,
         nominal: bool = False,
     ) -> None:
@@ -117,6 +82,8 @@ class QueryReader:
         self._camera = camera
         self._like = like
         self._known = known
+        self._cameras: Sequence[Camera] | None = None  # those, once asked for
+        self._paths = paths
         self._depth_scale = check_depth_scale(depth_scale)
         self._on_disk = on_disk or RecordingsOnDisk()
         self._say = say or (lambda line: None)
@@ -136,41 +103,96 @@ class QueryReader:
         if isinstance(image, str | PathLike):
             return self._of_file(Path(image), depth)
         name = name or ("image" if number is None else f"image {number}")
-        pixels = decode_color(image, name) if isinstance(image, bytes) else as_image(image, name)
+        way_out = "camera=(fx, fy, cx, cy), or like=RECORDING"
+        if isinstance(image, bytes):
+            return self._of_bytes(image, name, depth, None, way_out)
+        pixels = as_image(image, name)
         size = (pixels.shape[1], pixels.shape[0])
-        camera, scale = self._camera_of(name, size, None, "camera=(fx, fy, cx, cy), or like=RECORDING")
-        return QueryImage(name, pixels, camera, self._read_depth(depth, name, size, scale), None, None)
+        camera, scale = self._camera_of(name, size, None, way_out)
+        found = self._read_depth(depth, name, size, scale)
+        return self._at_scale_of_map(QueryImage(name, pixels, camera, found, None, None))
 
     def _of_file(self, path: Path, depth: Depth | None) -> QueryImage:
-        image = read_query_image(path)
-        size = (image.shape[1], image.shape[0])
-        found = self._on_disk.around(path)
+        data = read_bytes(path)
+        found = self._on_disk.around(path, self._paths, self._tell)
         way_out = "--camera fx,fy,cx,cy[,k1,k2,p1,p2,k3], or --like RECORDING"
-        camera, scale = self._camera_of(str(path), size, found, way_out)
-        depth_image = self._read_depth(depth, str(path), size, scale)
+        return self._of_bytes(data, str(path), depth, found, way_out)
+
+    def _of_bytes(
+        self, data: bytes, name: str, depth: Depth | None, found: tuple[Recording, FrameEntry] | None, way_out: str
+    ) -> QueryImage:
+        """A file in memory. A large JPEG is made smaller while it is decoded, so that it takes no more memory."""
+        header = header_of(data, name)
+        camera, scale = self._camera_of(name, header.size, found, way_out)
+        depth_image = self._read_depth(depth, name, header.size, scale)
         instances, pose, index, time = None, None, None, None
         if found is not None:
             recording, entry = found
             pose, index, time = entry.world_from_camera, entry.index, entry.timestamp_ns
             instances = recording.read_instances(entry)
-        return QueryImage(str(path), image, camera, depth_image, instances, pose, index, time)
+        if orientation_of(data) > 1:
+            self._tell(
+                f"{name} has an orientation mark, which is not applied: intrinsics belong to the pixels as stored"
+            )
+        reduction = reduction_of(times_finer(camera, self._map_cameras())) if header.kind == "jpeg" else 1
+        image = decode_color(data, name, reduction)
+        expected = camera if reduction == 1 else reduced_camera(camera, reduction)
+        if image.shape[:2] != (expected.height, expected.width):
+            raise FrameError(
+                f"{name}: has {image.shape[1]}x{image.shape[0]} pixels, but its header says "
+                f"{header.width}x{header.height}"
+            )
+        if reduction > 1 and depth_image is not None:
+            depth_image = np.asarray(smaller_values(depth_image, expected, reduction), dtype=np.float32)
+        query = QueryImage(name, image, expected, depth_image, instances, pose, index, time)
+        return self._at_scale_of_map(query, camera)
 
     def _of_frame(self, given: Frame, depth: Depth | None, name: str | None) -> QueryImage:
         frame = check_frame(given)
         size = (frame.image.shape[1], frame.image.shape[0])
         camera = frame.camera if self._camera is None else with_size(self._camera, size)
+        self._check_camera(camera, name or frame.name)
         scale = self._depth_scale or (None if self._like is None else self._like.depth_scale)
         found = frame.depth if depth is None else self._read_depth(depth, frame.name, size, scale)
-        return QueryImage(
-            name or frame.name,
-            frame.image,
-            camera,
-            found,
-            frame.instances,
-            frame.world_from_camera,
-            frame.index,
-            frame.timestamp_ns,
+        return self._at_scale_of_map(
+            QueryImage(
+                name or frame.name,
+                frame.image,
+                camera,
+                found,
+                frame.instances,
+                frame.world_from_camera,
+                frame.index,
+                frame.timestamp_ns,
+            )
         )
+
+    def _at_scale_of_map(self, query: QueryImage, original: Camera | None = None) -> QueryImage:
+        """The query no finer than the map's images; `original` is its camera before its file was made smaller."""
+        original = original or query.camera
+        times = times_finer(original, self._map_cameras())
+        found = at_scale(query, times * math.sqrt(query.camera.fx * query.camera.fy / (original.fx * original.fy)))
+        if times > 1:
+            self._tell(
+                f"{query.name} ({original.width}x{original.height}) is localized at {found.camera.width}x"
+                f"{found.camera.height}, the scale of the map's images"
+            )
+        remarks = [remark_on_color(found.image), None if found.depth is None else remark_on_depth(found.depth)]
+        for remark in filter(None, remarks):
+            self._tell(f"{query.name}: {remark}")
+        return found
+
+    def _map_cameras(self) -> Sequence[Camera]:
+        if self._cameras is None:
+            self._cameras = self._known()
+        return self._cameras
+
+    def _check_camera(self, camera: Camera, name: str) -> None:
+        problem = camera_problem(camera)
+        if problem is not None:
+            raise FrameError(f"{name}: its camera makes no sense: {problem}")
+        for doubt in camera_doubts(camera):
+            self._tell(f"camera of {name}: {doubt}")
 
     def _read_depth(
         self, depth: Depth | None, name: str, size: tuple[int, int], scale: float | None
@@ -181,13 +203,16 @@ class QueryReader:
         if isinstance(depth, str | PathLike):
             if scale is None:
                 raise UsageError(
-                    f"the depth scale of {depth} is not known: name a recording like it with --like RECORDING"
+                    f"the depth scale of {depth} is not known: give --depth-scale N, units per metre, or name a "
+                    "recording like it with --like RECORDING"
                 )
+            _check_scale(scale)
             return read_depth_image(Path(depth), scale, size)
         name = f"depth of {name}"
         if isinstance(depth, bytes):
             if scale is None:
                 raise UsageError(f"the scale of the {name} is not known: give depth_scale=, units per metre, or like=")
+            _check_scale(scale)
             return decode_depth(depth, name, scale, size)
         whole = np.issubdtype(np.asarray(depth).dtype, np.integer)
         return as_depth(depth, name, size, scale if whole else self._depth_scale)
@@ -198,16 +223,20 @@ class QueryReader:
         like_scale = None if self._like is None else self._like.depth_scale
         scale = self._depth_scale or like_scale or (found[0].depth_scale if found else None)
         if self._camera is not None:
-            return with_size(self._camera, size), scale
+            camera = with_size(self._camera, size)
+            self._check_camera(camera, name)
+            return camera, scale
         if self._like is not None:
+            self._tell_assumed(self._like.origin, self._like.assumed)
             _check_size(self._like.camera, size, name, self._like.origin)
             return self._like.camera, scale
         if found is not None:
             self._tell(f"camera of the images: that of the recording {found[0].path} they belong to")
+            self._tell_assumed(str(found[0].path), found[0].assumed)
             own = found[0].camera_of(found[1])
             _check_size(own, size, name, str(found[0].path))
             return own, scale
-        fitting = {camera for camera in self._known() if (camera.width, camera.height) == size}
+        fitting = {camera for camera in self._map_cameras() if (camera.width, camera.height) == size}
         if len(fitting) == 1:
             self._tell("camera of the images: that of the map's keyframes (--camera or --like name another)")
             return fitting.pop(), scale
@@ -215,10 +244,44 @@ class QueryReader:
             return Camera(*size, size[0], size[0], (size[0] - 1) / 2, (size[1] - 1) / 2), scale
         raise FrameError(f"the camera of {name} ({size[0]}x{size[1]}) is not known: give {way_out}")
 
+    def _tell_assumed(self, origin: str, assumed: Sequence[str]) -> None:
+        for line in assumed:
+            if not line.startswith("poses"):  # which are only drawn
+                self._tell(f"{origin}: {line}")
+
     def _tell(self, line: str) -> None:
         if line not in self._said:
             self._said.add(line)
             self._say(line)
+
+
+def at_scale(query: QueryImage, times: float) -> QueryImage:
+    """The query with `times` fewer rows and columns, intrinsics, depth and masks with it; itself for 1."""
+    if times == 1:
+        return query
+    camera = smaller_camera(query.camera, times)
+    instances = query.instances
+    if instances is not None:
+        labels = np.asarray(smaller_values(instances.labels, camera), dtype=np.uint16)
+        instances = InstanceMasks(labels, instances.categories)
+    depth = None if query.depth is None else np.asarray(smaller_values(query.depth, camera), dtype=np.float32)
+    image = smaller_image(query.image, camera)
+    return replace(query, image=image, camera=camera, depth=depth, instances=instances)
+
+
+def frame_at_scale(frame: Frame, known: Sequence[Camera]) -> Frame:
+    """A frame as a query of a map whose images `known` took: no finer than these; itself where it is not larger."""
+    times = times_finer(frame.camera, known)
+    if times == 1:
+        return frame
+    query = at_scale(QueryImage(frame.name, frame.image, frame.camera, frame.depth, frame.instances, None), times)
+    return replace(frame, image=query.image, camera=query.camera, depth=query.depth, instances=query.instances)
+
+
+def _check_scale(scale: float) -> None:
+    problem = depth_scale_problem(scale)
+    if problem is not None:
+        raise UsageError(problem)
 
 
 def _check_size(camera: Camera, size: tuple[int, int], name: str, origin: str) -> None:
@@ -227,22 +290,3 @@ def _check_size(camera: Camera, size: tuple[int, int], name: str, origin: str) -
             f"{name} is {size[0]}x{size[1]}, but the camera of {origin} is {camera.width}x{camera.height}: "
             "give --camera fx,fy,cx,cy"
         )
-
-
-def _changed(folder: Path) -> int:
-    """When names in a folder last changed; 0 where that cannot be known."""
-    try:
-        return folder.stat().st_mtime_ns
-    except OSError:
-        return 0
-
-
-def _open_or_none(folder: Path) -> tuple[Recording, dict[Path, FrameEntry]] | None:
-    """The one recording in `folder` with its frames by the path of their image; None where there is none."""
-    try:
-        recordings = open_recordings(folder)
-    except RecordingError:
-        return None
-    if len(recordings) != 1:
-        return None
-    return recordings[0], {entry.image_path.resolve(): entry for entry in recordings[0].entries}

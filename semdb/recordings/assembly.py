@@ -11,10 +11,12 @@ import numpy as np
 
 from semdb.errors import FrameError, RecordingError, UsageError
 from semdb.geometry import FARTHEST_POSE_M
+from semdb.names import storable
 from semdb.recordings.association import TOO_FAR
 from semdb.recordings.base import DroppedFrame, FrameData, FrameEntry, Recording
 from semdb.recordings.camera_files import CAMERA_FILE, find_camera_file
 from semdb.recordings.cameras import with_size
+from semdb.recordings.focus import NotAmongFramesError, in_focus, is_wanted
 from semdb.recordings.images import ImageHeader, inspect_file
 from semdb.recordings.intrinsics import camera_doubts, camera_problem
 from semdb.recordings.options import ReadOptions
@@ -88,6 +90,10 @@ def finish(draft: Draft, camera: Camera | None) -> Recording:
         else:
             kept.append(entry)
     draft.entries = kept
+    if draft.data is None:  # names that are no UTF-8 are for people here; the paths stay as they are
+        draft.entries = [_with_storable_name(entry) for entry in draft.entries]
+    if in_focus():
+        _keep_wanted(draft)
     if draft.data is not None:
         return _finish_data(draft, camera)
     headers, unreadable = _inspect_images(draft.entries)
@@ -118,6 +124,21 @@ def _impossible(entry: FrameEntry) -> str:
     return ""
 
 
+def _with_storable_name(entry: FrameEntry) -> FrameEntry:
+    return entry if entry.name.isascii() else replace(entry, name=storable(entry.name))
+
+
+def _keep_wanted(draft: Draft) -> None:
+    """Raises NotAmongFramesError where no frame is wanted."""
+    wanted: list[FrameEntry] = []
+    for entry in draft.entries:
+        if is_wanted(entry.image_path.name if draft.data is None else entry.name, len(wanted)):
+            wanted.append(entry)
+    if not wanted:
+        raise NotAmongFramesError(f"{draft.path}: the recording has no such frame")
+    draft.entries = wanted
+
+
 def _finish_data(draft: Draft, camera: Camera | None) -> Recording:
     chosen = draft.known_camera
     if camera is not None:
@@ -138,7 +159,7 @@ def _recording(draft: Draft, usable: Sequence[FrameEntry], camera: Camera) -> Re
         )
     return Recording(
         path=draft.path,
-        name=draft.name,
+        name=storable(draft.name),
         format=draft.format,
         camera=camera,
         depth_scale=draft.depth_scale,
@@ -161,6 +182,8 @@ def unknown_camera(path: Path) -> RecordingError:
 
 def no_usable_frame(draft: Draft) -> RecordingError:
     """The error for a recording of which every frame was dropped."""
+    if in_focus():
+        return NotAmongFramesError(f"{draft.path}: the recording has no usable frame of those that are wanted")
     if not draft.dropped:
         return RecordingError(f"{draft.path}: the recording lists no frame")
     first = draft.dropped[0]

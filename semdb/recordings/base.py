@@ -18,6 +18,8 @@ from semdb.recordings.images import (
     encode_16bit,
     encode_color,
     read_bytes,
+    remark_on_color,
+    remark_on_depth,
     scaled_depth,
 )
 from semdb.recordings.options import AS_THE_FORMAT_SAYS, ReadOptions
@@ -92,7 +94,8 @@ class Recording:
     `depth_scale` is units per metre of the depth files, `depth_registration` what `read` does to them ("" nothing),
     `categories` the class of each mask label where the recording has masks. `notes` are for people, and so is what
     of camera, depth and poses is `assumed` because no file says it; `said` is both.
-    `decode_failures` collects frames that looked right when the recording was opened but cannot be decoded.
+    `decode_failures` collects frames that looked right when the recording was opened but cannot be decoded, `remarks`
+    those that can be used but show next to nothing.
     """
 
     path: Path
@@ -113,6 +116,7 @@ class Recording:
     takes: frozenset[str] = frozenset()  # the options that mean something to its format
     contents: tuple[str, ...] = ()  # what else the file holds and what is taken of it, a line each for people
     decode_failures: list[DroppedFrame] = field(default_factory=list)
+    remarks: list[DroppedFrame] = field(default_factory=list)
     _failed: set[str] = field(default_factory=set)  # names of those
 
     @property
@@ -190,6 +194,10 @@ class Recording:
             self._failed.add(entry.name)
             self.decode_failures.append(DroppedFrame(entry.name, str(error)))
 
+    def note_remarks(self, frame: Frame) -> None:
+        """Remembers what people should know of a decoded frame."""
+        self.remarks += [DroppedFrame(frame.name, remark) for remark in remarks_on(frame)]
+
     def trajectory_length(self) -> float:
         """Metres travelled along the usable frames that have a pose."""
         poses = [entry.world_from_camera for entry in self.entries if entry.world_from_camera is not None]
@@ -227,6 +235,12 @@ class Recording:
             raise FrameError(f"{self.name_of(entry)}: depth of {width}x{height} pixels, but colour has another size")
         file = (raw.png or encode_16bit(raw.values)) if with_bytes else None
         return scaled_depth(raw.values, raw.scale), file, raw.scale
+
+
+def remarks_on(frame: Frame) -> list[str]:
+    """What people should know of a frame that shows next to nothing; empty for others."""
+    depth = None if frame.depth is None else remark_on_depth(frame.depth)
+    return [remark for remark in (remark_on_color(frame.image), depth) if remark is not None]
 
 
 @dataclass(frozen=True, slots=True)

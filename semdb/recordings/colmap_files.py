@@ -13,6 +13,7 @@ from typing import BinaryIO
 import numpy as np
 
 from semdb.errors import RecordingError
+from semdb.files import UnusableFileError, open_regular, parse_number, read_text, split_lines
 from semdb.geometry import pose_from, rotation_from_quat_wxyz
 from semdb.recordings.association import read_lines
 from semdb.recordings.lens import Lens
@@ -113,7 +114,7 @@ def _text_cameras(path: Path) -> dict[int, Lens]:
     for number, line in read_lines(path):
         parts = line.split()
         try:
-            lens = lens_of(parts[1], int(parts[2]), int(parts[3]), [float(value) for value in parts[4:]])
+            lens = lens_of(parts[1], int(parts[2]), int(parts[3]), [parse_number(value) for value in parts[4:]])
             lenses[int(parts[0])] = lens
         except (ValueError, IndexError) as error:
             raise RecordingError(f"{path}, line {number}: {error}") from error
@@ -123,10 +124,10 @@ def _text_cameras(path: Path) -> dict[int, Lens]:
 def _text_images(path: Path) -> dict[int, ModelImage]:
     """Two lines for each image; the second, of points, may be empty, so lines are not read by `read_lines`."""
     try:
-        text = path.read_text(encoding="utf-8-sig", errors="surrogateescape")
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
-    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if not line.startswith("#")]
+        text = read_text(path, escape=True)
+    except UnusableFileError as error:
+        raise RecordingError(error.at(path)) from error
+    lines = [(number, line) for number, line in enumerate(split_lines(text), 1) if not line.startswith("#")]
     while lines and not lines[0][1].strip():
         lines.pop(0)
     images: dict[int, ModelImage] = {}
@@ -137,7 +138,7 @@ def _text_images(path: Path) -> dict[int, ModelImage]:
         try:
             if len(parts) < 10:
                 raise ValueError("needs IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME")
-            pose = _pose([float(value) for value in parts[1:8]])
+            pose = _pose([parse_number(value) for value in parts[1:8]])
             seen = points[1].split()[2::3]
             image = ModelImage(int(parts[0]), parts[9].strip(), int(parts[8]), pose, sum(p != "-1" for p in seen))
         except ValueError as error:
@@ -152,7 +153,7 @@ def _text_points(path: Path) -> tuple[int, float]:
     errors = []
     for number, line in read_lines(path):
         try:
-            errors.append(float(line.split()[7]))
+            errors.append(parse_number(line.split()[7]))
         except (ValueError, IndexError) as error:
             raise RecordingError(f"{path}, line {number}: is no 3D point") from error
     return len(errors), float(np.mean(errors)) if errors else float("nan")
@@ -166,7 +167,7 @@ def _pose(values: list[float]) -> FloatArray:
 
 def _binary_cameras(path: Path) -> dict[int, Lens]:
     lenses: dict[int, Lens] = {}
-    with path.open("rb") as stream:
+    with _open(path) as stream:
         for _ in range(_count(stream, path, 24)):
             camera_id, model, width, height = struct.unpack("<IiQQ", _exact(stream, 24, path))
             name = BY_NUMBER.get(model, f"number {model}")
@@ -181,7 +182,7 @@ def _binary_cameras(path: Path) -> dict[int, Lens]:
 
 def _binary_images(path: Path) -> dict[int, ModelImage]:
     images: dict[int, ModelImage] = {}
-    with path.open("rb") as stream:
+    with _open(path) as stream:
         for _ in range(_count(stream, path, 73)):
             image_id, *values, camera_id = struct.unpack("<I7dI", _exact(stream, 64, path))
             name = _name(stream, path)
@@ -201,12 +202,19 @@ def _binary_points(path: Path) -> tuple[int, float]:
     if not path.is_file():
         return 0, float("nan")
     errors = []
-    with path.open("rb") as stream:
+    with _open(path) as stream:
         for _ in range(_count(stream, path, 51)):
             *_, error, track = struct.unpack("<Q3d3BdQ", _exact(stream, 51, path))
             _exact(stream, 8 * min(track, 1 << 40), path)
             errors.append(error)
     return len(errors), float(np.mean(errors)) if errors else float("nan")
+
+
+def _open(path: Path) -> BinaryIO:
+    try:
+        return open_regular(path)
+    except UnusableFileError as error:
+        raise RecordingError(error.at(path)) from error
 
 
 def _count(stream: BinaryIO, path: Path, least: int) -> int:

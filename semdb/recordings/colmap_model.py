@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from semdb.errors import RecordingError, UsageError
+from semdb.files import read_text
 from semdb.geometry import invert_pose
 from semdb.recordings.assembly import Draft, finish
 from semdb.recordings.base import DroppedFrame, FrameEntry, Layout, RawColor, RawDepth, Recording
@@ -108,7 +109,7 @@ def _scale(folder: Path, options: ReadOptions, path: Path) -> float:
     if options.scale is not None:
         return options.scale
     text = folder / "cameras.txt"
-    if not (folder / "cameras.bin").is_file() and text.is_file() and METRIC in text.read_text(errors="replace")[:4096]:
+    if not (folder / "cameras.bin").is_file() and text.is_file() and METRIC in read_text(text, escape=True)[:4096]:
         return 1.0
     raise UsageError(
         f"{path}: a model of COLMAP has no scale: give --scale N, the metres of one unit (1 where it was made metric)"

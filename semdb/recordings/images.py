@@ -29,6 +29,7 @@ from semdb.types import Float32Array, ImageArray
 MOST_IMAGE_BYTES = 1 << 29
 MOST_REDUCED_PIXELS = 1 << 28
 """Of a JPEG that is decoded at a half or less: 268 million."""
+NOT_DECODED = "is not an image that can be decoded (PNG and JPEG can)"
 START = 1 << 16
 TAIL = 4096
 DARK = 16  # of 255: nearly black is what has 99 of 100 pixels below
@@ -63,6 +64,17 @@ def inspect_file(path: Path) -> ImageHeader:
         raise FrameError(f"the file cannot be read: {error.strerror}") from error
     except (UnusableFileError, ImageFileError) as error:
         raise FrameError(str(error)) from error
+
+
+def header_of(data: bytes, name: str) -> ImageHeader:
+    """The header of an image file in memory; a JPEG may be as large as one that is made smaller. Raises FrameError."""
+    most = MOST_REDUCED_PIXELS if data.startswith(JPEG_START) else MOST_PIXELS
+    try:
+        return read_header(data, most)
+    except NotAnImageError as error:
+        raise FrameError(f"{name}: {NOT_DECODED}") from error
+    except ImageFileError as error:
+        raise FrameError(f"{name}: {error}") from error
 
 
 def _inspect(file: BinaryIO) -> ImageHeader:
@@ -107,7 +119,7 @@ def _decode(data: bytes, flags: int, most_pixels: int = MOST_PIXELS) -> npt.NDAr
     try:
         header = read_header(data, most_pixels)
     except NotAnImageError as error:
-        raise ImageFileError("is not an image that can be decoded (PNG and JPEG can)") from error
+        raise ImageFileError(NOT_DECODED) from error
     if header.kind == "png":
         # all chunks are checked first: libpng would print, and give back what it has
         pixels = png.decode(png.read_header(data[: png.HEADER_BYTES]), list(png.chunks(data)))
@@ -123,7 +135,7 @@ def _decode(data: bytes, flags: int, most_pixels: int = MOST_PIXELS) -> npt.NDAr
     finally:
         cv2.utils.logging.setLogLevel(level)
     if image is None:
-        raise ImageFileError("is not an image that can be decoded (PNG and JPEG can)")
+        raise ImageFileError(NOT_DECODED)
     return np.asarray(image)
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from semdb.errors import FrameError, RecordingError
+from semdb.files import parse_number
 from semdb.geometry import invert_pose, pose_error, pose_from, rotation_from_quat_wxyz
 from semdb.recordings.assembly import Draft, finish
 from semdb.recordings.association import read_lines
@@ -178,7 +179,10 @@ def _sensors(path: Path, notes: list[str]) -> dict[str, Sensor]:
             if values[3] not in MODELS:
                 raise ValueError(f"camera model {values[3]!r} is not known")
             lens = lens_of(
-                values[3], int(float(values[4])), int(float(values[5])), [float(value) for value in values[6:]]
+                values[3],
+                int(parse_number(values[4])),
+                int(parse_number(values[5])),
+                [parse_number(value) for value in values[6:]],
             )
         except (ValueError, IndexError) as error:
             notes.append(f"{path.name} line {number}: sensor {values[0]}: {error}: left out")
@@ -226,7 +230,7 @@ def _records(path: Path) -> list[_Record]:
 
 
 def _matrix(values: list[str]) -> FloatArray:
-    numbers = [float(value) for value in values]
+    numbers = [parse_number(value) for value in values]
     if not np.isfinite(numbers).all():
         raise ValueError("has a number that is not finite")
     return pose_from(rotation_from_quat_wxyz(numbers[:4]), numbers[4:])

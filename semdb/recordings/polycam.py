@@ -90,6 +90,7 @@ def open_polycam(path: Path, camera: Camera | None = None, options: ReadOptions 
         notes=notes,
         known_camera=known,
         depth_scale=scale,
+        assumed_scale="" if options.depth_scale else "that of Polycam",
         data=_PolycamData(confidence, known, scale),
     )
     return finish(draft, camera)

@@ -154,6 +154,7 @@ def _open(path: Path, camera: Camera | None, options: ReadOptions) -> Recording:
         notes=notes,
         known_camera=known_camera,
         depth_scale=options.depth_scale or MILLIMETRES,
+        assumed_scale="" if options.depth_scale else "that of RTAB-Map",
         data=_RtabmapData(path, connection, places, known_camera, options.depth_scale or MILLIMETRES),
         contents=_contents(connection, version, optimised),
     )

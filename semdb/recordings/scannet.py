@@ -143,6 +143,7 @@ def open_scannet_folder(path: Path, camera: Camera | None = None, options: ReadO
         notes=notes,
         known_camera=known,
         depth_scale=scale,
+        assumed_scale="" if options.depth_scale else "that of ScanNet",
     )
     if depth:
         depth_size = _size_of(entries, [entry.depth_path for entry in entries if entry.depth_path])

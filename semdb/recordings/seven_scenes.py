@@ -17,6 +17,7 @@ from semdb.recordings.assembly import Draft, finish, no_usable_frame, use_camera
 from semdb.recordings.base import DroppedFrame, FrameEntry, Layout, Recording
 from semdb.recordings.camera_files import read_matrix
 from semdb.recordings.cameras import SEVEN_SCENES_COLOR, SEVEN_SCENES_DEPTH_SCALE
+from semdb.recordings.focus import is_wanted
 from semdb.recordings.options import ReadOptions
 from semdb.recordings.poses import rigid_pose
 from semdb.recordings.registration import DEPTH_FROM_COLOR, REGISTRATION_7SCENES
@@ -73,6 +74,8 @@ def open_seven_scenes(path: Path, camera: Camera | None = None, options: ReadOpt
     if not has_poses:
         draft.notes.append("no frame-*.pose.txt: the frames have no pose and cannot become keyframes")
     for number, parts in sorted(files.items()):
+        if not is_wanted(parts.get("color", ""), len(draft.entries)):
+            continue
         entry = _entry(draft, number, parts, has_depth, has_poses, options)
         if isinstance(entry, DroppedFrame):
             draft.dropped.append(entry)

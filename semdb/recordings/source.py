@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from semdb.errors import RecordingError, RecordingUnavailableError, UsageError
+from semdb.names import path_text, written
 from semdb.recordings.cameras import parse_camera
 from semdb.recordings.credentials import refuse_credentials
 from semdb.recordings.options import AS_THE_FORMAT_SAYS, ReadOptions, read_options, write_options
@@ -57,13 +58,14 @@ class Source:
 def write_source(address: str, camera: str | None, options: ReadOptions | None = None) -> str:
     """What the database keeps: the absolute path or the URL, and the camera and the options that were given by hand.
 
+    Bytes of the path that are no UTF-8 are written as `semdb.names` has it.
     Raises UsageError for a URL with a password.
     """
     refuse_credentials(address)
-    where = address if is_address(address) else str(Path(address).absolute())
+    where = written(address if is_address(address) else str(Path(address).absolute()))
     said = [] if camera is None else [f"camera={camera}"]
-    if written := write_options(options or ReadOptions()):
-        said.append(written)
+    if text := write_options(options or ReadOptions()):
+        said.append(text)
     return f"{where}?{'&'.join(said)}" if said else where
 
 
@@ -71,11 +73,11 @@ def parse_source(source: str) -> Source:
     """What `write_source` wrote."""
     found = _SAID.search(source)
     if found is None:
-        return Source(source)
+        return Source(path_text(source))
     said, camera = source[found.start() + 1 :], None
     if said.startswith("camera="):
         camera, _, said = said.removeprefix("camera=").partition("&")
-    return Source(source[: found.start()], camera, read_options(said))
+    return Source(path_text(source[: found.start()]), camera, read_options(said))
 
 
 def locate(address: str, settings: Settings) -> Path:

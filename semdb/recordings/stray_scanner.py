@@ -60,6 +60,7 @@ def open_stray_scanner(path: Path, camera: Camera | None = None, options: ReadOp
         notes=notes,
         known_camera=known,
         depth_scale=scale,
+        assumed_scale="" if options.depth_scale else "that of Stray Scanner",
         data=_StrayData(video, confidence, known, scale),
     )
     return finish(draft, camera)

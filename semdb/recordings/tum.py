@@ -28,6 +28,7 @@ from semdb.recordings.association import (
 )
 from semdb.recordings.base import DroppedFrame, FrameEntry, Layout, Recording
 from semdb.recordings.cameras import TUM_DEPTH_SCALE, tum_camera
+from semdb.recordings.focus import is_wanted
 from semdb.recordings.options import ReadOptions
 from semdb.shown import measure
 from semdb.storable_names import name_problem
@@ -176,6 +177,8 @@ def _associate(
         times = np.array([file.time_ns for _, file in kept], dtype=np.int64)
         partner, gaps = nearest_pairs(times, np.array([file.time_ns for file in depth], dtype=np.int64))
     for (index, file), match, gap in zip(kept, partner, gaps.tolist(), strict=True):
+        if not is_wanted(file.name, len(draft.entries)):
+            continue
         if depth is not None and match is None:
             reason = f"no depth image within {LIMIT_MS:g} ms (the nearest: {_milliseconds(gap)} ms)"
             draft.dropped.append(DroppedFrame(file.name, reason))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import struct
 import zlib
 from pathlib import Path
@@ -12,7 +13,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from typer.testing import CliRunner
 
+from semdb.cli.main import app
 from semdb.errors import FrameError
 from semdb.recordings import decode_color, open_recording, read_query_image
 from semdb.recordings.headers import read_header
@@ -244,3 +247,22 @@ def test_remarks() -> None:
     assert remark_on_depth(depth) == "the depth image is nearly empty"
     depth[:2] = 1
     assert remark_on_depth(depth) is None
+
+
+def test_frames_that_show_nothing_are_named_and_used(tmp_path: Path) -> None:
+    walk = write_tum(tmp_path / "walk", n=4)
+    black = np.zeros((48, 64, 3), np.uint8)
+    (walk / "rgb/100.000000.png").write_bytes(encoded(black + 5, ".png"))
+    (walk / "rgb/100.100000.png").write_bytes(encoded(black + 200, ".png"))
+    (walk / "depth/100.204000.png").write_bytes(encoded(np.zeros((48, 64), np.uint16), ".png"))
+    found = CliRunner().invoke(app, ["recording", str(walk), "--json"])
+    assert found.exit_code == 0
+    [content] = json.loads(found.stdout)
+    assert content["usable"] == 4
+    assert content["remarks"] == [
+        {"name": "rgb/100.000000.png", "remark": "the colour image is nearly black"},
+        {"name": "rgb/100.100000.png", "remark": "the colour image is nearly empty: one colour"},
+        {"name": "rgb/100.200000.png", "remark": "the depth image is nearly empty"},
+    ]
+    text = CliRunner().invoke(app, ["recording", str(walk)]).stdout
+    assert "look at      1 x the colour image is nearly black: rgb/100.000000.png" in text
