@@ -23,6 +23,7 @@ from semdb.errors import FrameError, RecordingError, UsageError
 from semdb.recordings.arrays import CameraLike, as_camera, as_depth, as_image, as_pose, check_depth_scale
 from semdb.recordings.base import DroppedFrame, FrameEntry, Recording
 from semdb.recordings.images import encode_16bit, encode_color
+from semdb.threads import each
 from semdb.types import FROM_MEMORY, Camera, Frame, InstanceMasks
 
 SOURCE = "frames from memory"
@@ -146,13 +147,16 @@ class _Spool:
         if frame.index in self.entries:
             raise RecordingError(f"{frame.name}: a frame with the index {frame.index} came before; each needs its own")
         self.camera = self.camera or frame.camera
+        self._check_depth(frame)
+        self._check_masks(frame)
+        paths = dict(each(self._write, self._files(frame), 2))  # a live camera does not wait: colour beside depth
         self.entries[frame.index] = FrameEntry(
             index=frame.index,
             name=frame.name,
             timestamp_ns=frame.timestamp_ns,
-            image_path=self._write(frame.index, "color", frame.image_bytes or encode_color(frame.image)),
-            depth_path=None if frame.depth is None else self._write(frame.index, "depth", self._depth(frame)),
-            masks_path=None if frame.instances is None else self._masks(frame.index, frame.instances),
+            image_path=paths["color"],
+            depth_path=paths.get("depth"),
+            masks_path=paths.get("masks"),
             world_from_camera=frame.world_from_camera,
             camera=None if frame.camera == self.camera else frame.camera,
         )
@@ -190,13 +194,29 @@ class _Spool:
             "ingest has steps for it (1000: millimetres up to 65.5 m)",
         )
 
-    def _write(self, index: int, kind: str, data: bytes) -> Path:
-        path = self.folder / f"{index:08d}.{kind}"
-        path.write_bytes(data)
-        return path
+    def _files(self, frame: Frame) -> list[_File]:
+        files = [_File(frame, "color", lambda: frame.image_bytes or encode_color(frame.image))]
+        if frame.depth is not None:
+            files.append(_File(frame, "depth", lambda: self._depth(frame)))
+        if (instances := frame.instances) is not None:
+            files.append(_File(frame, "masks", lambda: encode_16bit(instances.labels)))
+        return files
 
-    def _depth(self, frame: Frame) -> bytes:
-        """The file of a frame's depth."""
+    def _write(self, file: _File) -> tuple[str, Path]:
+        path = self.folder / f"{file.frame.index:08d}.{file.kind}"
+        try:
+            path.write_bytes(file.data())
+        except OSError as error:
+            raise RecordingError(
+                f"{file.frame.name}: cannot be kept in {self.folder.parent} while frames come in: {error.strerror}; "
+                "TMPDIR names a folder with room"
+            ) from error
+        return file.kind, path
+
+    def _check_depth(self, frame: Frame) -> None:
+        """A recording has one kind of depth files."""
+        if frame.depth is None:
+            return
         if frame.depth_bytes is not None and frame.depth_scale is None:
             raise RecordingError(f"{frame.name}: has depth_bytes but no depth_scale, units per metre of that file")
         own = (self.own_scale, "")
@@ -204,22 +224,36 @@ class _Spool:
         self.depth = self.depth or kind
         if kind != self.depth:
             raise RecordingError(f"{frame.name}: depth of {kind} units per metre, of the frames before {self.depth}")
+
+    def _depth(self, frame: Frame) -> bytes:
+        """The file of a frame's depth."""
         if frame.depth_bytes is not None:
             return frame.depth_bytes
         assert frame.depth is not None
-        values = np.rint(np.nan_to_num(frame.depth, nan=0.0).astype(np.float64) * self.own_scale)
+        values = np.rint(np.nan_to_num(frame.depth, nan=0.0) * np.float32(self.own_scale))
         beyond = values > LARGEST
-        self.too_far += bool(beyond.any())
-        return encode_16bit(np.where(beyond, 0, values).astype(np.uint16))
+        if beyond.any():
+            self.too_far += 1
+            values[beyond] = 0
+        return encode_16bit(values.astype(np.uint16))
 
-    def _masks(self, index: int, instances: InstanceMasks) -> Path:
-        for label, category in instances.categories.items():
+    def _check_masks(self, frame: Frame) -> None:
+        """A label is one class in all frames."""
+        for label, category in ({} if frame.instances is None else frame.instances.categories).items():
             if self.categories.setdefault(int(label), category) != category:
                 raise RecordingError(
-                    f"frame {index}: label {label} of its masks is {category!r}, of the frames before "
+                    f"{frame.name}: label {label} of its masks is {category!r}, of the frames before "
                     f"{self.categories[int(label)]!r}: a label is one class in all frames"
                 )
-        return self._write(index, "masks", encode_16bit(instances.labels))
+
+
+@dataclass(frozen=True, slots=True)
+class _File:
+    """A file that is to be written of a frame; `data` makes it."""
+
+    frame: Frame
+    kind: str
+    data: Callable[[], bytes]
 
 
 def _check_instances(instances: InstanceMasks | None, name: str, size: tuple[int, int]) -> InstanceMasks | None:

@@ -180,3 +180,13 @@ def test_progress_and_an_error_of_the_source_leave_nothing(tmp_path: Path) -> No
         recording_of(broken(), "live", folder=tmp_path, progress=lambda *at: told.append(at)).__enter__()
     assert told == [(1, 0)]
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(self: Path, data: bytes) -> int:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(RecordingError, match=r"frame 0: cannot be kept in .*: No space left on device; TMPDIR names"):
+        recording_of([frame(0)], "live", folder=tmp_path).__enter__()
+    assert list(tmp_path.iterdir()) == []
