@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from semdb.database import schema
 from semdb.database.engine import make_engine
 from semdb.database.store import Store, open_store
+from semdb.recordings import open_recording
+from semdb.types import Frame
+from tests.integration.opened import Opening, opener
+from tests.unit.onnx_files import write_constant_model, write_mean_embedding_model
 
 
 @pytest.fixture
@@ -24,3 +30,40 @@ def database_url(empty_url: str) -> str:
 def store(database_url: str) -> Iterator[Store]:
     with open_store(database_url) as opened:
         yield opened
+
+
+@pytest.fixture
+def open_db(database_url: str, tmp_path: Path) -> Iterator[Opening]:
+    """On each server in turn."""
+    with opener(database_url, tmp_path / "cache") as opening:
+        yield opening
+
+
+@pytest.fixture
+def open_file(tmp_path: Path) -> Iterator[Opening]:
+    """On SQLite alone: for what is not the database's."""
+    with opener(f"sqlite:///{tmp_path / 'semdb.sqlite3'}", tmp_path / "cache") as opening:
+        yield opening
+
+
+@pytest.fixture(scope="module")
+def frames(room: Path) -> list[Frame]:
+    return list(open_recording(room).frames())
+
+
+@pytest.fixture
+def networks(tmp_path: Path) -> dict[str, str]:
+    """A detector that always sees a chair, and an encoder: for images without masks of their own."""
+    masks = np.zeros((1, 1, 240, 320), np.float32)
+    masks[:, :, 40:200, 60:260] = 1
+    detector = write_constant_model(
+        tmp_path / "mask_rcnn.onnx",
+        {
+            "boxes": np.array([[60, 40, 259, 199]], np.float32),
+            "labels": np.array([62], np.int64),
+            "scores": np.array([0.9], np.float32),
+            "masks": masks,
+        },
+    )
+    encoder = write_mean_embedding_model(tmp_path / "places.onnx")
+    return {"detector": f"onnx:{detector}", "encoder": f"onnx:{encoder}"}
