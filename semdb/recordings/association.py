@@ -173,11 +173,14 @@ def parse_pose(values: Sequence[str], quaternion: str | None = None) -> tuple[Fl
     return quat_wxyz / norm, numbers[:3]
 
 
-def read_trajectory(path: Path, options: ReadOptions | None = None) -> tuple[Trajectory, list[str]]:
+def read_trajectory(
+    path: Path, options: ReadOptions | None = None, times_ns: Sequence[int] = ()
+) -> tuple[Trajectory, list[str]]:
     """Poses of a TUM trajectory (``time tx ty tz qx qy qz qw``) sorted by time, and notes on what was not right.
 
-    Lines that cannot be used are left out and noted; of equal times the first is kept. `options` say what the poses
-    are of; what is returned are ``world_from_camera`` at the times of colour.
+    A line may have the 16 (or 12) numbers of a matrix instead, after the time or alone: then lines belong to `times_ns`
+    in turn. Lines that cannot be used are left out and noted; of equal times the first is kept. `options`
+    say what the poses are of; what is returned are ``world_from_camera`` at the times of colour.
     Raises RecordingError when no line can be used.
     """
     options = options or ReadOptions()
@@ -188,11 +191,14 @@ def read_trajectory(path: Path, options: ReadOptions | None = None) -> tuple[Tra
     samples: list[tuple[int, FloatArray, FloatArray]] = []
     bad: list[BadLine] = []
     commas = False
-    for number, line in lines:
+    for place, (number, line) in enumerate(lines):
         values, has_commas = fields_of(line)
         commas |= has_commas
         try:
-            samples.append((parse_time_ns(values[0]), *parse_pose(values[1:], options.quaternion)))
+            if len(values) in (12, 16) and place >= len(times_ns):
+                raise ValueError(f"is a matrix without a time, and there are only {len(times_ns)} colour images")
+            time_ns = times_ns[place] if len(values) in (12, 16) else parse_time_ns(values[0])
+            samples.append((time_ns, *_parse_sample(values, options.quaternion)))
         except ValueError as error:
             bad.append(BadLine(number, str(error)))
     if not samples:
@@ -246,6 +252,16 @@ def _in_order(
         notes.append(f"{path.name}: {int((~first).sum())} repeated time(s); the first pose of each is kept")
     keep = order[first]
     return corrected(Trajectory(times[keep], quats_wxyz[keep], translations[keep]), options), notes
+
+
+def _parse_sample(values: Sequence[str], quaternion: str | None) -> tuple[FloatArray, FloatArray]:
+    """Quaternion wxyz and translation of a line's values, a matrix or a quaternion, its time among them or not."""
+    if len(values) not in (12, 13, 16, 17):
+        return parse_pose(values[1:], quaternion)
+    from semdb.recordings.poses import numbers_of, pose_of_numbers
+
+    pose = pose_of_numbers(numbers_of(" ".join(values[len(values) % 2 :])))
+    return quat_wxyz_from_rotation(pose[:3, :3]), pose[:3, 3]
 
 
 def corrected(trajectory: Trajectory, options: ReadOptions) -> Trajectory:

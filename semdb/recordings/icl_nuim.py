@@ -30,9 +30,11 @@ from semdb.recordings.association import (
 from semdb.recordings.base import DroppedFrame, FrameEntry, Layout, Recording
 from semdb.recordings.cameras import ICL_NUIM, TUM_DEPTH_SCALE
 from semdb.recordings.options import ReadOptions
+from semdb.recordings.poses import numbers_of, rigid_pose
 from semdb.types import Camera, FloatArray
 
 POSES = "*.gt.freiburg"
+MATRICES = "*.gt.sim"  # the same poses as 3x4 matrices, three lines each, numbered from 1
 NUMBER = re.compile(r"[0-9]{1,9}")
 FRAME = re.compile(r"[0-9]{1,9}(\.0*)?")
 FLIP_Y = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -42,7 +44,7 @@ def is_icl_nuim(path: Path) -> bool:
     """Whether a folder has ICL-NUIM's poses, or its associations without TUM's lists."""
     if not path.is_dir():
         return False
-    if any(path.glob(POSES)):
+    if any(path.glob(POSES)) or any(path.glob(MATRICES)):
         return True
     return (path / ASSOCIATIONS).exists() and not (path / "rgb.txt").exists() and not has_times(path / ASSOCIATIONS)
 
@@ -73,7 +75,9 @@ def open_icl_nuim(path: Path, camera: Camera | None = None, options: ReadOptions
         draft.notes.append(f"{ASSOCIATIONS}: frame numbers are not in ascending order; sorted")
     poses = _read_poses(path, draft.notes, options)
     if poses is not None:
-        draft.assumed.append(f"poses: {POSES} is left-handed with y up, as ICL-NUIM's, and is mirrored")
+        draft.assumed.append(
+            f"poses: {POSES} (or {MATRICES}, from 1 on) is left-handed with y up, as ICL-NUIM's, and is mirrored"
+        )
     used: dict[int, str] = {}
     for index, (number, depth_name, colour_name) in enumerate(sorted(rows, key=lambda row: row[0])):
         if number in used:
@@ -121,6 +125,8 @@ def _list_images(path: Path) -> tuple[list[tuple[int, str, str]], list[DroppedFr
 
 def _read_poses(path: Path, notes: list[str], options: ReadOptions) -> dict[int, FloatArray] | None:
     files = sorted(path.glob(POSES))
+    if not files and any(path.glob(MATRICES)):
+        return _read_matrices(path, options)
     if not files:
         notes.append(f"no {POSES}: the frames have no pose and cannot become keyframes")
         return None
@@ -156,9 +162,34 @@ def _read_poses(path: Path, notes: list[str], options: ReadOptions) -> dict[int,
     return poses
 
 
+def _read_matrices(path: Path, options: ReadOptions) -> dict[int, FloatArray]:
+    """Poses of the one ``*.gt.sim``: blocks of three lines of four numbers, from frame 1 on. Raises RecordingError."""
+    files = sorted(path.glob(MATRICES))
+    if len(files) > 1:
+        names = ", ".join(file.name for file in files)
+        raise RecordingError(f"{path}: several ground truths ({names}); keep the one of this recording")
+    rows = []
+    for number, line in read_lines(files[0]):
+        try:
+            rows.append(numbers_of(line))
+            if len(rows[-1]) != 4:
+                raise ValueError(f"has {len(rows[-1])} numbers instead of four")
+        except ValueError as error:
+            raise RecordingError(f"{files[0]}, line {number}: {error}") from error
+    if not rows or len(rows) % 3:
+        raise RecordingError(f"{files[0]}: has {len(rows)} lines; three lines of a 3x4 matrix are needed for each pose")
+    poses = {}
+    for number, start in enumerate(range(0, len(rows), 3), start=1):
+        try:
+            poses[number] = pose_from_icl(options.pose(rigid_pose(rows[start : start + 3])))
+        except ValueError as error:
+            raise RecordingError(f"{files[0]}: pose {number} {error}") from error
+    return poses
+
+
 LAYOUT = Layout(
     "icl_nuim",
-    "ICL-NUIM (associations.txt, *.gt.freiburg)",
+    "ICL-NUIM (associations.txt, *.gt.freiburg or *.gt.sim)",
     is_icl_nuim,
     lambda path, camera, options: [open_icl_nuim(path, camera, options)],
     frozenset({"depth_scale", "poses_are", "axes", "scale", "quaternion"}),

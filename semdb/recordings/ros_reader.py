@@ -130,7 +130,7 @@ class Bag:
         """One error for a file that `rosbags` cannot read: why, and what can still be read."""
         from semdb.recordings.ros_broken import what_is_left
 
-        reason = str(error).rstrip(".") or type(error).__name__
+        reason = " ".join(str(error).split())[:300].rstrip(".") or type(error).__name__
         return RecordingError(f"{self.path}: cannot be read as a bag: {reason}. {what_is_left(self.path)}")
 
     def _header(self, data: bytes, time_ns: int) -> tuple[int, str]:

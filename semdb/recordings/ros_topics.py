@@ -54,6 +54,7 @@ def choose_topics(bag: Bag, options: ReadOptions) -> Chosen:
 def no_images(bag: Bag, depth: Sequence[str] = ()) -> str:
     """What is said of a bag without colour images: what it holds instead."""
     held = "; ".join(f"{topic.name} ({topic.kind}, {topic.messages})" for topic in bag.topics if topic.messages)
+    held = " ".join(held.split())
     only = f"colour images: its images {', '.join(depth)} are depth" if depth else "images"
     return f"{bag.path}: has no {only}, so it makes no map. It holds {held or 'no message'}"
 

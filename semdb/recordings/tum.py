@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -73,7 +74,7 @@ def open_tum(path: Path, camera: Camera | None = None, options: ReadOptions | No
     )
     colour = _sorted_by_time(files, listed, draft.notes)
     depth = _read_depth_list(path, pairs, draft.notes, options)
-    trajectory = _read_poses(path, draft.notes, options)
+    trajectory = _read_poses(path, draft.notes, options, [file.time_ns for file in files])
     draft.categories = read_categories(path)
     if draft.categories is not None:
         draft.format = "synthetic"
@@ -135,11 +136,11 @@ def _read_depth_list(
     return unique
 
 
-def _read_poses(path: Path, notes: list[str], options: ReadOptions) -> Trajectory | None:
+def _read_poses(path: Path, notes: list[str], options: ReadOptions, times_ns: Sequence[int]) -> Trajectory | None:
     if not (path / "groundtruth.txt").exists():
         notes.append("no groundtruth.txt: the frames have no pose and cannot become keyframes")
         return None
-    trajectory, pose_notes = read_trajectory(path / "groundtruth.txt", options)
+    trajectory, pose_notes = read_trajectory(path / "groundtruth.txt", options, times_ns)
     notes += pose_notes
     return trajectory
 

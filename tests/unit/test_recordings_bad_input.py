@@ -31,9 +31,9 @@ def walk(tmp_path: Path) -> Path:
 def test_no_such_path_a_file_an_empty_folder_and_other_stuff(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="no such folder"):
         open_recording(tmp_path / "nowhere")
-    (tmp_path / "file.bag").write_text("x")
+    (tmp_path / "file.xyz").write_text("x")
     with pytest.raises(RecordingError, match="is a file that no reader knows; known are: "):
-        open_recording(tmp_path / "file.bag")
+        open_recording(tmp_path / "file.xyz")
     (tmp_path / "empty").mkdir()
     with pytest.raises(RecordingError, match="the folder is empty"):
         open_recording(tmp_path / "empty")

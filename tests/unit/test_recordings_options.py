@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semdb.errors import UsageError
+from semdb.errors import RecordingError, UsageError
 from semdb.geometry import invert_pose, pose_error, pose_from, rotation_from_quat_wxyz
 from semdb.recordings import ReadOptions, open_recording
 from semdb.recordings.options import AXES, read_options, write_options
@@ -144,3 +144,39 @@ def test_options_are_written_and_read(options: ReadOptions) -> None:
 def test_written_options_that_are_none(text: str, message: str) -> None:
     with pytest.raises(UsageError, match=message):
         read_options(text)
+
+
+def test_icl_nuim_with_matrices_is_the_same(tmp_path: Path) -> None:
+    right, other = write_icl(tmp_path / "right"), write_icl(tmp_path / "other")
+    expected = open_recording(right, SMALL).entries
+    [file] = other.glob("*.gt.freiburg")
+    blocks = []
+    for line in file.read_text().splitlines():
+        x, y, z, qx, qy, qz, qw = map(float, line.split()[1:])
+        one = pose_from(rotation_from_quat_wxyz([qw, qx, qy, qz]), [x, y, z])
+        blocks.append("\n".join(" ".join(f"{value:.12g}" for value in row) for row in one[:3]) + "\n\n")
+    file.rename(other / "kept.txt")
+    (other / "livingRoom1.gt.sim").write_text("".join(blocks))
+    found = open_recording(other, SMALL).entries
+    assert [entry.index for entry in found] == [entry.index for entry in expected]
+    for one_entry, two in zip(found, expected, strict=True):
+        assert one_entry.world_from_camera is not None
+        assert two.world_from_camera is not None
+        assert max(pose_error(one_entry.world_from_camera, two.world_from_camera)) < 1e-6
+    (other / "livingRoom1.gt.sim").write_text("1 2 3 4\n")
+    with pytest.raises(RecordingError, match=r"gt.sim: has 1 lines; three lines of a 3x4 matrix are needed"):
+        open_recording(other, SMALL)
+
+
+@pytest.mark.parametrize("timed", [True, False])
+@pytest.mark.parametrize("numbers", [12, 16])
+def test_tum_with_matrices(tmp_path: Path, timed: bool, numbers: int) -> None:
+    folder = write_tum(tmp_path / "walk")
+    rows = [" ".join(f"{value:.12g}" for value in pose(i).ravel()[:numbers]) for i in range(6)]
+    lines = [f"{time} {row}" for time, row in zip(TIMES, rows, strict=True)] if timed else rows
+    (folder / "groundtruth.txt").write_text("\n".join(lines))
+    assert_right(poses_of(folder, ReadOptions()))
+    if not timed:
+        (folder / "groundtruth.txt").write_text("\n".join([*lines, lines[0]]))
+        notes = open_recording(folder).notes
+        assert any("there are only 6 colour images" in note for note in notes)
