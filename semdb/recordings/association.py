@@ -226,6 +226,8 @@ def _read_plain(
     except ValueError:
         return None
     numbers = np.array([parts[1:] for parts in texts], dtype=np.float64)
+    if not (np.abs(numbers[:, :3]) <= FARTHEST_POSE_M).all():
+        return None
     quats = numbers[:, 3:] if quaternion == "wxyz" else numbers[:, [6, 3, 4, 5]]
     with np.errstate(over="ignore"):
         norms = np.sqrt((quats * quats).sum(axis=1, keepdims=True))
