@@ -12,13 +12,13 @@ import numpy as np
 from semdb.errors import FrameError, RecordingError, UsageError
 from semdb.geometry import FARTHEST_POSE_M
 from semdb.names import storable
-from semdb.recordings.association import TOO_FAR
 from semdb.recordings.base import DroppedFrame, FrameData, FrameEntry, Recording
 from semdb.recordings.camera_files import CAMERA_FILE, find_camera_file
 from semdb.recordings.cameras import with_size
 from semdb.recordings.focus import NotAmongFramesError, in_focus, is_wanted
 from semdb.recordings.images import ImageHeader, inspect_file
 from semdb.recordings.intrinsics import camera_doubts, camera_problem
+from semdb.recordings.lines import TOO_FAR
 from semdb.recordings.options import ReadOptions
 from semdb.recordings.registration import depth_size
 from semdb.shown import number

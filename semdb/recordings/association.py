@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semdb.errors import RecordingError
-from semdb.files import UnusableFileError, fields_of, numbered_lines, parse_number, read_text, without_comment
+from semdb.files import fields_of, parse_number, without_comment
 from semdb.geometry import (
     FARTHEST_POSE_M,
     pose_from,
@@ -22,14 +22,15 @@ from semdb.geometry import (
     slerp_wxyz,
     so3_log,
 )
+from semdb.recordings.lines import TOO_FAR, BadLine, read_lines
 from semdb.recordings.options import ReadOptions
+from semdb.recordings.poses import numbers_of, pose_of_numbers
 from semdb.types import FloatArray
 
 MAX_TIME_DIFFERENCE_NS = 20_000_000
 TURN_WINDOW_NS = 50_000_000
 ASSOCIATIONS = "associations.txt"
 LONGEST_TIME = 100  # characters
-TOO_FAR = f"is farther than {FARTHEST_POSE_M / 1000:.0f} km from the origin"
 NORM_TOLERANCE = 0.05  # data sets round quaternions to four digits; more than this is no rotation
 
 _TIME_AND_NAME = re.compile(r"([^\s,;]+(?:,\d+)?)(?:\s*[,;]\s*|\s+)(\S.*)")
@@ -37,14 +38,6 @@ _PLAIN_POSE = re.compile(r"[^\s,;#%/]{1,100}(?:\s+[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE
 _UNUSUAL = re.compile(r"""["'\\#%]|\s//""")
 
 Int64Array = npt.NDArray[np.int64]
-
-
-@dataclass(frozen=True, slots=True)
-class BadLine:
-    """A line of a list that cannot be used."""
-
-    line: int
-    reason: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,14 +56,6 @@ class Trajectory:
     time_ns: Int64Array  # [n]
     quat_wxyz: FloatArray  # [n, 4], unit
     translation: FloatArray  # [n, 3] metres
-
-
-def read_lines(path: Path) -> list[tuple[int, str]]:
-    """Numbered (from 1) lines that are neither empty nor a comment; see `semdb.files`. Raises RecordingError."""
-    try:
-        return numbered_lines(read_text(path, escape=True))
-    except UnusableFileError as error:
-        raise RecordingError(error.at(path)) from error
 
 
 def parse_time_ns(text: str) -> int:
@@ -260,8 +245,6 @@ def _parse_sample(values: Sequence[str], quaternion: str | None) -> tuple[FloatA
     """Quaternion wxyz and translation of a line's values, a matrix or a quaternion, its time among them or not."""
     if len(values) not in (12, 13, 16, 17):
         return parse_pose(values[1:], quaternion)
-    from semdb.recordings.poses import numbers_of, pose_of_numbers
-
     pose = pose_of_numbers(numbers_of(" ".join(values[len(values) % 2 :])))
     return quat_wxyz_from_rotation(pose[:3, :3]), pose[:3, 3]
 

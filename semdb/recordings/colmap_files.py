@@ -15,8 +15,8 @@ import numpy as np
 from semdb.errors import RecordingError
 from semdb.files import UnusableFileError, open_regular, parse_number, read_text, split_lines
 from semdb.geometry import pose_from, rotation_from_quat_wxyz
-from semdb.recordings.association import read_lines
 from semdb.recordings.lens import Lens
+from semdb.recordings.lines import read_lines
 from semdb.types import FloatArray
 
 # name -> number in binary files, how many parameters, and what they are

@@ -20,15 +20,14 @@ from semdb.geometry import pose_from, rotation_from_quat_wxyz
 from semdb.recordings.assembly import Draft, finish, use_camera_file
 from semdb.recordings.association import (
     ASSOCIATIONS,
-    BadLine,
     bad_lines_note,
     decimal_commas_note,
     has_times,
     parse_pose,
-    read_lines,
 )
 from semdb.recordings.base import DroppedFrame, FrameEntry, Layout, Recording
 from semdb.recordings.cameras import ICL_NUIM, TUM_DEPTH_SCALE
+from semdb.recordings.lines import BadLine, read_lines
 from semdb.recordings.options import ReadOptions
 from semdb.recordings.poses import numbers_of, rigid_pose
 from semdb.types import Camera, FloatArray

@@ -16,11 +16,11 @@ from semdb.errors import FrameError, RecordingError
 from semdb.files import parse_number
 from semdb.geometry import invert_pose, pose_error, pose_from, rotation_from_quat_wxyz
 from semdb.recordings.assembly import Draft, finish
-from semdb.recordings.association import read_lines
 from semdb.recordings.base import DroppedFrame, FrameEntry, Layout, RawColor, RawDepth, Recording
 from semdb.recordings.colmap_files import HALF, MODELS, lens_of
 from semdb.recordings.images import decode_color, read_bytes
 from semdb.recordings.lens import Lens, Straightener, as_camera
+from semdb.recordings.lines import read_lines
 from semdb.recordings.options import ReadOptions
 from semdb.recordings.own_depth import SCALE, DepthCamera, as_raw, in_color
 from semdb.types import Camera, FloatArray

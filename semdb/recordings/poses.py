@@ -11,7 +11,7 @@ import numpy.typing as npt
 from semdb.errors import RecordingError
 from semdb.files import fields_of, parse_number
 from semdb.geometry import FARTHEST_POSE_M, pose_from, project_to_so3
-from semdb.recordings.association import TOO_FAR, BadLine, read_lines
+from semdb.recordings.lines import TOO_FAR, BadLine, read_lines
 from semdb.types import FloatArray
 
 ROTATION_TOLERANCE = 0.02  # matrices of real data sets are off by up to 4e-4

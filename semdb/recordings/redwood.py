@@ -15,8 +15,8 @@ import numpy as np
 from semdb.errors import RecordingError
 from semdb.files import UnusableFileError, read_json
 from semdb.recordings.assembly import Draft, finish, use_camera_file
-from semdb.recordings.association import read_lines
 from semdb.recordings.base import Layout, Recording
+from semdb.recordings.lines import read_lines
 from semdb.recordings.numbered import entries_of, numbered_files
 from semdb.recordings.options import ReadOptions
 from semdb.recordings.poses import numbers_of, rigid_pose

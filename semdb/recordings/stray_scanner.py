@@ -14,10 +14,11 @@ import numpy as np
 from semdb.errors import FrameError, RecordingError
 from semdb.geometry import pose_from, rotation_from_quat_wxyz
 from semdb.recordings.assembly import Draft, finish
-from semdb.recordings.association import parse_pose, parse_time_ns, read_lines
+from semdb.recordings.association import parse_pose, parse_time_ns
 from semdb.recordings.base import DroppedFrame, FrameEntry, Layout, RawColor, RawDepth, Recording
 from semdb.recordings.cameras import with_size
 from semdb.recordings.images import decode_gray, read_bytes, scaled_depth
+from semdb.recordings.lines import read_lines
 from semdb.recordings.numbered import numbered_files
 from semdb.recordings.options import ReadOptions
 from semdb.recordings.own_depth import DepthCamera, confident, in_color, resized
