@@ -191,10 +191,17 @@ def _eight_bits(pixels: npt.NDArray[np.uint16]) -> ImageArray:
 
 
 def decode_color_grey(data: bytes, name: str) -> ImageArray:
-    """Grey ``[H, W]`` uint8 of an image in memory, the same pixels as `decode_color`. Raises FrameError."""
+    """Grey ``[H, W]`` uint8 of an image in memory, turned as `decode_color` has it. Raises FrameError."""
     try:
+        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
         if data.startswith(JPEG_START):  # its brightness is stored as such
-            return np.asarray(_decode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION), dtype=np.uint8)
+            return np.asarray(_decode(data, flags), dtype=np.uint8)
+        if data.startswith(b"\x89PNG") and data[24:25] != b"\x10":  # of at most 8 bits: as the decoder weighs colours
+            for _ in png.chunks(data):  # checked first: libpng would print, and give back what it has
+                pass
+            grey = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+            if grey is not None:
+                return np.asarray(grey, dtype=np.uint8)
         return np.asarray(cv2.cvtColor(_decode_color(data, 1), cv2.COLOR_RGB2GRAY), dtype=np.uint8)
     except ImageFileError as error:
         raise FrameError(f"{name}: {error}") from error

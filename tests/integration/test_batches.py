@@ -167,7 +167,7 @@ def test_a_batch_that_is_too_much_is_done_one_by_one(
     seen = Bright(lambda images: len(images) > 2)
     assert ingest(room, store, describer(3, seen)).stored == 8
     said = [fields for name, fields in events if name == "one_by_one"]
-    assert said == [{"frames": 3, "error": "bright: does not see"}] * 2
+    assert said == [{"frames": 3, "error": "ModelError: bright: does not see"}] * 2
     assert seen.given == [3, 1, 1, 1, 3, 1, 1, 1, 2]
     assert content(store) == expected
 

@@ -43,7 +43,8 @@ def settings_of(url: str) -> Settings:
     return Settings(database_url=url, detector="recorded", encoder="gist", features="surf", threads=1)
 
 
-def test_they_are_ingested_localized_and_logged_on_every_server(cafe: Path, empty_url: str) -> None:
+def test_they_are_ingested_localized_and_logged_on_every_server(cafe: Path, database_url: str) -> None:
+    empty_url = database_url
     [summary] = ingest_recordings([cafe], settings_of(empty_url), IngestOptions(stride=6))
     assert (summary.recording, summary.map_name) == (r"caf\udce9", r"caf\udce9")
     assert (summary.stored, summary.failed) == (4, {})
