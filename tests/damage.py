@@ -23,9 +23,8 @@ from typing import Any
 import numpy as np
 from sqlalchemy import DateTime, Double, Integer, LargeBinary, String, Table, Text, TypeDecorator
 
-from semdb.cli import keypoints as keypoints_command
+import semdb
 from semdb.cli import status as status_command
-from semdb.database import items, reporting
 from semdb.database.codecs import MASK_MAGIC, decode_array, encode_array
 from semdb.database.planning import check_models
 from semdb.database.records import StoredImage
@@ -332,11 +331,12 @@ class Reader:
         return found
 
     def status(self, store: Store) -> Any:
-        recordings, failed = status_command.look(store, None)
-        refined = status_command.refinements_of(store)
-        reporting.workers(store.engine)
-        items.unsent(store.engine)
-        return [status_command.as_json(item, failed, refined.get(item.map_id, {})) for item in recordings]
+        with semdb.open(f"sqlite:///{store.engine.url.database}", say=store.say) as database:
+            database.workers()
+            database.unsent()
+            found = database.status()
+            refined = status_command.refinements_of(found.refinements)
+        return [status_command.as_json(item, found.failed, refined.get(item.map_id, {})) for item in found.recordings]
 
     def sql(self, store: Store) -> Localization:
         self.found = None
@@ -379,13 +379,15 @@ class Reader:
         for keyframe_id in range(1, KEYFRAMES + 1):
             try:
                 (loaded,) = store.load_keyframes([keyframe_id], descriptors=False)
-                total += len(keypoints_command.rows(loaded))
+                total += len(loaded.keypoints)
                 image: StoredImage = store.load_image(keyframe_id)
                 store.load_masks(keyframe_id)
                 total += len(image.rgb)
             except (CodecError, NotFoundError) as error:
-                failure = error
-        total += len(store.keyframe_heads(1, limit=2, bad=store.left_out))
+                failure = failure or error
+        with semdb.open(f"sqlite:///{store.engine.url.database}", say=store.say) as database:
+            for keyframe in database.keyframes("m", limit=2):
+                total += len(keyframe.objects) + len(keyframe.keypoints)
         if failure is not None:
             raise failure
         return total

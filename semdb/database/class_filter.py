@@ -105,8 +105,11 @@ def class_scores(engine: Engine, map_id: int, query: ClassQuery, keyframe_ids: S
 
 
 def _is_score(points: Any, query: ClassQuery) -> bool:
-    """Not of a keyframe whose strength, which SQLite may have as anything, divides by nothing."""
-    return isinstance(points, int | float | Decimal) and 0 <= points <= query.whole
+    """Not of a keyframe whose strength, which SQLite may have as anything, divides by nothing.
+
+    That of all there is may be a little more than one, by rounding.
+    """
+    return isinstance(points, int | float | Decimal) and 0 <= points <= 2 * query.whole
 
 
 def _known(connection: Connection, query: ClassQuery) -> list[tuple[int, ClassTerm]]:
