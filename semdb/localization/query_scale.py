@@ -23,6 +23,8 @@ REDUCTIONS = (8, 4, 2)  # that a JPEG is made smaller by while it is decoded
 
 def times_finer(camera: Camera, known: Sequence[Camera]) -> float:
     """How many times finer than the finest of the map's cameras `known` a larger image of `camera` is; else 1.0."""
+    # a camera of a damaged row says nothing of scale; what is damaged of it is said where its keyframes are read
+    known = [other for other in known if other.fx * other.fy > 0 and math.isfinite(other.fx * other.fy)]
     if not known or camera.width * camera.height <= max(other.width * other.height for other in known):
         return 1.0
     finest = max(math.sqrt(other.fx * other.fy) for other in known)

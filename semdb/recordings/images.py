@@ -196,13 +196,12 @@ def decode_color_grey(data: bytes, name: str) -> ImageArray:
         flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
         if data.startswith(JPEG_START):  # its brightness is stored as such
             return np.asarray(_decode(data, flags), dtype=np.uint8)
+        colours = _decode_color(data, 1)  # checked first: libpng would print, and give back what it has
         if data.startswith(b"\x89PNG") and data[24:25] != b"\x10":  # of at most 8 bits: as the decoder weighs colours
-            for _ in png.chunks(data):  # checked first: libpng would print, and give back what it has
-                pass
             grey = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
             if grey is not None:
                 return np.asarray(grey, dtype=np.uint8)
-        return np.asarray(cv2.cvtColor(_decode_color(data, 1), cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+        return np.asarray(cv2.cvtColor(colours, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
     except ImageFileError as error:
         raise FrameError(f"{name}: {error}") from error
 

@@ -74,7 +74,7 @@ def hostile_database() -> None:
             "UPDATE maps SET name = :x",
             "UPDATE recordings SET name = :x || id, source = '/data/' || :x, format = substr(:x, 1, 32)",
             "UPDATE categories SET name = :x || id",
-            "UPDATE models SET name = :x, config = :x",
+            "UPDATE models SET name = :x, config = json_object('x', :x)",
             "UPDATE ingest_items SET state = 'failed', error = :x WHERE recording_id = 1 AND frame_index = 3",
         ):
             connection.execute(text(statement), {"x": HOSTILE})
