@@ -74,9 +74,8 @@ def open_icl_nuim(path: Path, camera: Camera | None = None, options: ReadOptions
         draft.notes.append(f"{ASSOCIATIONS}: frame numbers are not in ascending order; sorted")
     poses = _read_poses(path, draft.notes, options)
     if poses is not None:
-        draft.assumed.append(
-            f"poses: {POSES} (or {MATRICES}, from 1 on) is left-handed with y up, as ICL-NUIM's, and is mirrored"
-        )
+        source = POSES if any(path.glob(POSES)) else f"{MATRICES}, numbered from 1,"
+        draft.assumed.append(f"poses: {source} is left-handed with y up, as ICL-NUIM's, and is mirrored")
     used: dict[int, str] = {}
     for index, (number, depth_name, colour_name) in enumerate(sorted(rows, key=lambda row: row[0])):
         if number in used:
