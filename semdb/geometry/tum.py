@@ -10,6 +10,9 @@ TUM_COLUMNS = "# timestamp tx ty tz qx qy qz qw"
 
 def tum_line(timestamp_ns: int, world_from_camera: FloatArray) -> str:
     """``time tx ty tz qx qy qz qw`` (s, m, unit quaternion) of a pose ``[4, 4]``, the time to the nanosecond."""
-    seconds, rest = divmod(timestamp_ns, 10**9)
+    sign = "-" if timestamp_ns < 0 else ""
+    seconds, rest = divmod(abs(timestamp_ns), 10**9)
     w, x, y, z = quat_wxyz_from_rotation(world_from_camera[:3, :3])
-    return f"{seconds}.{rest:09d} " + " ".join(f"{value:.9f}" for value in (*world_from_camera[:3, 3], x, y, z, w))
+    return f"{sign}{seconds}.{rest:09d} " + " ".join(
+        f"{value:.9f}" for value in (*world_from_camera[:3, 3], x, y, z, w)
+    )

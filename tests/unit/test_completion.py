@@ -17,6 +17,8 @@ from semdb.cli.completion.shells import BASH, ZSH, Shell, install
 from semdb.cli.main import COMMANDS, app
 from semdb.database.store import open_store
 from semdb.evaluation.methods import METHODS
+from semdb.exchange.formats import FORMATS
+from semdb.recordings.options import AXES, CAMERA_FROM_WORLD, QUATERNIONS, WORLD_FROM_CAMERA
 from semdb.refinement.run import STEPS
 from tests.database_samples import fill
 from tests.terminal import Terminal
@@ -84,6 +86,9 @@ def test_lines_are_split_as_a_shell_does(line: str, expected: Line) -> None:
         ("semdb models pull resnet50-", ["resnet50-places365"]),
         ("semdb ingest --detector onnx:", ["onnx:net.onnx", "onnx:", "FILES"]),
         ("semdb ingest --encoder g", ["gist", "FILES"]),
+        ("semdb export p", ["ply"]),
+        ("semdb export ply ", ["hall 2", "room"]),
+        ("semdb localize --axes o", ["opencv", "opengl"]),
         ("semdb nothing --map ", []),
         ("semdb doctor x ", []),
     ],
@@ -137,6 +142,10 @@ def test_names_are_no_code_of_the_shell(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_fixed_values_are_those_that_there_are() -> None:
     assert set(values.METHODS) <= set(METHODS)
+    assert list(values.EXPORTS) == list(FORMATS)
+    assert [name for name, _ in values.FIXED["--axes"]] == list(AXES)
+    assert [name for name, _ in values.FIXED["--quaternion"]] == list(QUATERNIONS)
+    assert [name for name, _ in values.FIXED["--poses-are"]] == [WORLD_FROM_CAMERA, CAMERA_FROM_WORLD]
     assert [name for name, _ in values.FIXED["--step"]] == [step.kind for step in STEPS]
 
 

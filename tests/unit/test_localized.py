@@ -49,6 +49,7 @@ def test_lines_of_tum() -> None:
     )
     assert tum_line(1305031102175304001, pose) == expected
     assert tum_line(7, pose).startswith("0.000000007 ")
+    assert tum_line(-1_500_000_000, pose).startswith("-1.500000000 ")
 
 
 def test_only_what_was_localized_is_in_a_trajectory() -> None:

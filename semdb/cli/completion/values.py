@@ -15,6 +15,7 @@ Environment = Mapping[str, str]
 
 MOST_NAMES = 200
 _PATHS = re.compile(r"\b(PATH|FILE|FOLDER|DIR|IMAGE)\b")  # words of metavars
+EXPORTS = ("tum", "colmap", "kapture", "ply", "mcap", "semdb")
 METHODS = ("semdb", "cnn", "paper", "chen", "sift-reference", "oracle", "colmap")
 FIXED: Mapping[str, Entries] = {
     "--features": (("surf", "SURF, 64 dimensions"), ("sift", "SIFT"), ("orb", "ORB, binary")),
@@ -26,6 +27,9 @@ FIXED: Mapping[str, Entries] = {
     "--method": tuple((name, "") for name in METHODS),
     "--protocol": (("paper", "keyframes and queries of one recording"), ("split", "of different ones")),
     "--truth": (("given", "poses of the recording"), ("refined", "by structure from motion"), ("both", "")),
+    "--poses-are": (("world_from_camera", "usual"), ("camera_from_world", "inverted")),
+    "--axes": (("opencv", "z forward"), ("opengl", "z back"), ("arkit", "z back"), ("ros", "x forward")),
+    "--quaternion": (("xyzw", "as TUM"), ("wxyz", "")),
     "--optimizer": (("sgd", ""), ("adamw", "")),
     "--database-url": (("sqlite:///", "a file"), ("mysql+pymysql://", "a server")),
 }
@@ -49,6 +53,8 @@ def of_argument(command: Any, argument: Any, given: Given, environment: Environm
     key = f"{command.name} {argument.name}"
     if key in _ARGUMENTS:
         return _ARGUMENTS[key](given, environment)
+    if argument.metavar == "MAP":
+        return _maps(given, environment)
     return _of_type(argument)
 
 
@@ -131,6 +137,10 @@ def _published(_given: Given, _environment: Environment) -> tuple[Entries, bool]
     return [*((model.name, model.description) for model in PUBLISHED), ("all", "")], False
 
 
+def _formats(_given: Given, _environment: Environment) -> tuple[Entries, bool]:
+    return [(name, "") for name in EXPORTS], False
+
+
 _COMPUTED: Mapping[str, Callable[[Given, Environment], tuple[Entries, bool]]] = {
     "--map": _maps,
     "--like": _recordings_or_folders,
@@ -142,4 +152,5 @@ _ARGUMENTS: Mapping[str, Callable[[Given, Environment], tuple[Entries, bool]]] =
     "map name": _maps,
     "pull names": _published,
     "evaluate-detector spec": _detectors,
+    "export form": _formats,
 }
