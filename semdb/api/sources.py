@@ -65,7 +65,7 @@ def open_source(
         _refuse("a recording that is open", camera=options.camera, **options.reading.given())
         yield [source if options.name is None else replace(source, name=options.name)]
     elif isinstance(source, Sequence) and source and all(isinstance(path, str | PathLike) for path in source):
-        yield open_all([str(path) for path in source], settings, options)
+        yield open_all([str(path) for path in source], settings, options, progress)
     elif isinstance(source, Iterable):
         others = {key: value for key, value in options.reading.given().items() if key != "depth_scale"}
         _refuse("frames, which bring all of that", camera=options.camera, **others)

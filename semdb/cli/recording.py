@@ -40,9 +40,12 @@ def command(
     Every image is decoded, so that broken ones are found.
     """
     from semdb.cli.output import print_json, print_lines
+    from semdb.cli.progress import Progress
     from semdb.recordings import open_recordings, parse_camera
+    from semdb.recordings.focus import watched
 
-    recordings = open_recordings(path, None if camera is None else parse_camera(camera), reading)
+    with Progress(f"looking at the files of {path.name}", unit="files") as progress, watched(progress.update):
+        recordings = open_recordings(path, None if camera is None else parse_camera(camera), reading)
     if not quick and not check:
         for recording in recordings:
             decode_all(recording)

@@ -61,7 +61,7 @@ def queue_recordings(
     summaries = []
     opening = open_store(settings.database_url, create=True) if store is None else nullcontext(store)
     with opening as opened:
-        for recording in open_all(paths, settings, options):
+        for recording in open_all(paths, settings, options, progress):
             known = map_models_of(opened, options.map_of(recording))
             specs = specs_for_ingest(settings, known, has_masks=recording.categories is not None)
             for note in (*recording.said, *specs.notes):

@@ -10,6 +10,7 @@ import hashlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 from semdb.database import items
@@ -28,6 +29,7 @@ from semdb.perception.describe import Describer, describer_from_specs
 from semdb.perception.model_choice import ModelSpecs, settings_of_map, specs_for_ingest
 from semdb.recordings import open_recordings, parse_camera
 from semdb.recordings.base import DroppedFrame, FrameEntry, Recording
+from semdb.recordings.focus import watched
 from semdb.recordings.options import AS_THE_FORMAT_SAYS, ReadOptions
 from semdb.recordings.source import locate, write_source
 from semdb.settings import Settings
@@ -107,7 +109,7 @@ def ingest_recordings(
     cannot be used at all, UsageError when the models or the plan contradict what is stored, DatabaseError.
     """
     options = options or IngestOptions()
-    recordings = open_all(paths, settings, options)
+    recordings = open_all(paths, settings, options, progress)
     with open_store(settings.database_url, create=True) as store:
         return ingest_opened(recordings, store, settings, options, progress=progress, say=say)
 
@@ -188,7 +190,9 @@ def keep_findings(store: Store, summary: IngestSummary, findings: Sequence[Recor
         summary.findings = tuple(findings)
 
 
-def open_all(paths: Sequence[Path | str], settings: Settings, options: IngestOptions) -> list[Recording]:
+def open_all(
+    paths: Sequence[Path | str], settings: Settings, options: IngestOptions, progress: Progress | None = None
+) -> list[Recording]:
     """Every recording under `paths`, which are folders or URLs, under the names that they will have.
 
     Raises RecordingError for a path that cannot be used, UsageError where names collide or one name is given to many.
@@ -196,7 +200,9 @@ def open_all(paths: Sequence[Path | str], settings: Settings, options: IngestOpt
     camera = None if options.camera is None else parse_camera(options.camera)
     recordings = []
     for path in paths:
-        for recording in open_recordings(locate(str(path), settings), camera, options.reading):
+        with watched(None if progress is None else partial(progress, f"looking at the files of {path}")):
+            found = open_recordings(locate(str(path), settings), camera, options.reading)
+        for recording in found:
             below = recording.path.name if recording.path.name != Path(str(path)).name else None
             address = str(path) if below is None else f"{path}/{below}"
             recording.source = write_source(address, options.camera, options.reading)

@@ -15,7 +15,7 @@ from semdb.names import storable
 from semdb.recordings.base import DroppedFrame, FrameData, FrameEntry, Recording
 from semdb.recordings.camera_files import CAMERA_FILE, find_camera_file
 from semdb.recordings.cameras import with_size
-from semdb.recordings.focus import NotAmongFramesError, in_focus, is_wanted
+from semdb.recordings.focus import NotAmongFramesError, in_focus, is_wanted, told
 from semdb.recordings.images import ImageHeader, inspect_file
 from semdb.recordings.intrinsics import camera_doubts, camera_problem
 from semdb.recordings.lines import TOO_FAR
@@ -103,7 +103,7 @@ def finish(draft: Draft, camera: Camera | None) -> Recording:
     chosen = _choose_camera(draft, camera, [header for _, header in headers])
     _check_cameras(draft, [entry for entry, _ in headers], chosen, camera)
     usable = []
-    for found, header in headers:
+    for found, header in told(headers, len(draft.entries), len(draft.entries) + len(headers)):
         entry = found if camera is None else replace(found, camera=None)
         own = entry.camera or chosen
         reason = _problem(entry, header, own, depth_size(own, draft.depth_registration))
@@ -196,7 +196,7 @@ def _inspect_images(
     entries: Sequence[FrameEntry],
 ) -> tuple[list[tuple[FrameEntry, ImageHeader]], list[DroppedFrame]]:
     headers, dropped = [], []
-    for entry in entries:
+    for entry in told(entries, 0, 2 * len(entries)):
         try:
             headers.append((entry, inspect_file(entry.image_path)))
         except FrameError as error:

@@ -1,19 +1,21 @@
-"""Which frames of a recording somebody wants, where that is not all: others are then neither looked at nor checked.
+"""What whoever opens a recording wants beside it: only some of its frames, and to hear how far the work has come.
 
 Whoever asks where one image was taken wants the camera, and perhaps masks and pose, of one frame in a recording of
-perhaps a hundred thousand. The wish is of the context and not an argument, because only readers that would look at
-files frame by frame have to know of it.
+perhaps a hundred thousand: others are then neither looked at nor checked. Whoever opens all of it waits for a look at
+each file. Both wishes are of the context and no arguments, because few readers have to know of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
+from typing import TypeVar
 
 from semdb.errors import RecordingError
 
+FEW = 1000  # files, which are looked at in less than a second
 ENOUGH = 20  # frames of which one should be readable, where any will do
 
 
@@ -29,6 +31,29 @@ class Focus:
 
 
 _focus: ContextVar[Focus | None] = ContextVar("focus", default=None)
+
+
+_watcher: ContextVar[Callable[[int, int], None] | None] = ContextVar("watcher", default=None)
+_Item = TypeVar("_Item")
+
+
+@contextmanager
+def watched(progress: Callable[[int, int], None] | None) -> Iterator[None]:
+    """Within, `progress` hears of how many files of a recording, of how many, have been looked at when it is opened."""
+    token = _watcher.set(progress)
+    try:
+        yield
+    finally:
+        _watcher.reset(token)
+
+
+def told(items: Sequence[_Item], done: int, total: int) -> Iterator[_Item]:
+    """`items`, while whoever watches hears of them after `done` of `total`; of few files there is no news."""
+    progress = _watcher.get() if total > FEW else None
+    for number, item in enumerate(items, start=done + 1):
+        yield item
+        if progress is not None and (number % 64 == 0 or number == total):
+            progress(number, total)
 
 
 @contextmanager

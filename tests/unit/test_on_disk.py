@@ -13,7 +13,7 @@ from semdb.errors import RecordingError
 from semdb.geometry import pose_error
 from semdb.localization.on_disk import RecordingsOnDisk
 from semdb.recordings import open_recording, open_recordings
-from semdb.recordings.focus import NotAmongFramesError, only_images
+from semdb.recordings.focus import NotAmongFramesError, only_images, watched
 from semdb.recordings.images import inspect_file
 from tests.unit.recording_miniatures import SMALL, pose, write_camera_json, write_icl, write_seven_scenes, write_tum
 
@@ -144,3 +144,21 @@ def test_a_broken_frame_beside_it_does_no_harm(tmp_path: Path) -> None:
     assert found is not None
     np.testing.assert_allclose(found[0].read(found[1]).world_from_camera, pose(1), atol=1e-8)
     assert RecordingsOnDisk().around(folder / "rgb" / "100.000000.png") is None
+
+
+def test_whoever_opens_a_large_recording_hears_how_far_it_is(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "walk", n=3)
+    for name in ("rgb.txt", "depth.txt"):
+        file = (folder / name).read_text().splitlines()[1].split()[1]
+        (folder / name).write_text("".join(f"{100 + k / 30:.6f} {file}\n" for k in range(700)))
+    (folder / "groundtruth.txt").unlink()
+    heard: list[tuple[int, int]] = []
+    with watched(lambda done, total: heard.append((done, total))):
+        assert len(open_recording(folder).entries) == 700
+    assert heard[0] == (64, 1400)
+    assert heard[-1] == (1400, 1400)
+    assert [done for done, _ in heard] == sorted(done for done, _ in heard)
+    heard.clear()
+    with watched(lambda done, total: heard.append((done, total))):
+        open_recording(write_tum(tmp_path / "small", n=3))
+    assert heard == []
