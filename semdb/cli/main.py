@@ -27,6 +27,7 @@ from semdb.shown import for_terminal
 COMMANDS: dict[str, str] = {
     "init": "semdb.cli.init",
     "recording": "semdb.cli.recording",
+    "trajectory": "semdb.cli.trajectory",
     "ingest": "semdb.cli.ingest",
     "status": "semdb.cli.status",
     "retry": "semdb.cli.status:retry",

@@ -8,10 +8,9 @@ from pathlib import Path
 
 from semdb.errors import UsageError
 from semdb.evaluation.metrics import EvaluationResult, QueryResult
-from semdb.geometry.tum import TUM_COLUMNS, tum_line
+from semdb.geometry.tum import INDEX_NOTE, TUM_COLUMNS, tum_line
 
 LONGEST_STEM = 200  # bytes, of the 255 that file systems take
-INDEX_NOTE = "frames have no time stamps: the first column is the frame index, in seconds"
 
 
 def write_trajectories(directory: Path, results: Sequence[EvaluationResult]) -> list[Path]:

@@ -6,6 +6,7 @@ from semdb.geometry.se3 import quat_wxyz_from_rotation
 from semdb.types import FloatArray
 
 TUM_COLUMNS = "# timestamp tx ty tz qx qy qz qw"
+INDEX_NOTE = "frames have no time stamps: the first column is the frame index, in seconds"
 
 
 def tum_line(timestamp_ns: int, world_from_camera: FloatArray) -> str:

@@ -73,6 +73,7 @@ class BundleProblem:
     rows: FloatArray  # [k]
     keyframe_from_world: FloatArray  # [c - 1, 4, 4]
     looser: FloatArray | None = None  # [k] how many times the sensor's noise a depth has; None: once
+    expected_turn: FloatArray | None = None  # [c, 3] of each image, the query first; None: none
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,6 +129,9 @@ class _Solver:
         self.images = len(problem.keyframe_from_world) + 1
         self.information = np.zeros((self.images, 9))  # of the priors
         self.drift = np.ones((self.images, 9))  # how many times the priors' sigma each unknown has
+        self.expected = np.zeros((self.images, 9))  # by the priors
+        if problem.expected_turn is not None:
+            self.expected[:, 6:] = problem.expected_turn
 
     def drifting(self, camera_from_world: FloatArray) -> None:
         """Poses of a trajectory drift apart as in a random walk: a keyframe's variance grows with its distance from
@@ -147,6 +151,10 @@ class _Solver:
         information[QUERY, :6] = 0.0
         return information
 
+    def offset(self, state: _State) -> FloatArray:
+        """How far ``[c, 9]`` the images are from what the priors expect."""
+        return np.concatenate([state.shift, state.turn], axis=1) - self.expected
+
     def linearise(self, state: _State) -> _Blocks:
         from semdb.localization.bundle_kernels import normal_equations
 
@@ -162,7 +170,7 @@ class _Solver:
             blocks.images, blocks.image_gradients, blocks.coupling, blocks.points, blocks.point_gradients, blocks.chi2,
             blocks.own_gradients,
         )  # fmt: skip
-        offset = np.concatenate([state.shift, state.turn], axis=1)
+        offset = self.offset(state)
         axis = np.arange(9)
         blocks.images[:, axis, axis] += self.information
         blocks.image_gradients += self.information * offset
@@ -252,7 +260,7 @@ def adjust(
     solver = _Solver(problem)
     count = solver.images
     poses = np.concatenate([camera_from_world[None], problem.keyframe_from_world])
-    state = _State(poses, np.zeros((count, 3)), np.zeros((count, 6)), problem.points)
+    state = _State(poses, solver.expected[:, 6:].copy(), np.zeros((count, 6)), problem.points)
     if start is not None:
         state = _State(start.image_from_world, start.turn, start.shift, problem.points)
     greatest = np.array([prior.keyframe_m, prior.keyframe_rad, prior.turn_rad])
@@ -294,7 +302,7 @@ def _evident_sigma(
     determine; iterated on the equations of the solution, which are those of the priors `greatest`.
     """
     reduced, gradient = solver.reduced(blocks, 0.0)
-    offset = np.concatenate([state.shift, state.turn], axis=1).reshape(-1)
+    offset = solver.offset(state).reshape(-1)
     old, drift = solver.information.reshape(-1), solver.drift.reshape(-1)
     data = reduced - np.diag(old)
     pull = data @ offset - (gradient - old * offset)

@@ -80,6 +80,7 @@ class PoseEstimate:
     residual_px: float  # median reprojection error of the inliers
     spread: float  # 0..1: share of a 4x4 grid over the image that holds inliers
     aligned: int = 0  # pairs whose patches are alike to a fraction of a pixel; 0 without images
+    seen: Alignment | None = None  # where the query shows `pairs`, to a fraction of a pixel where patches were aligned
 
 
 def match_views(query: View, keyframes: Sequence[KeyframeView], options: PoseOptions) -> list[Matches]:
@@ -182,12 +183,16 @@ def estimate_pose(
         error = reprojection_px(query, camera_from_world, pairs.query, points)
         return _estimate(query, keyframes, pairs, error, camera_from_world, None, first, options)
     try:
-        pairs, error, refined, aligned = _refine(query, keyframes, pairs, points, agreeing, camera_from_world, options)
+        pairs, error, refined, seen = _refine(query, keyframes, pairs, points, agreeing, camera_from_world, options)
     except np.linalg.LinAlgError:
         return None
     pose, covariance = refined.camera_from_world, refined.covariance
     estimate = _estimate(query, keyframes, pairs, error, pose, covariance, first, options)
-    return None if estimate is None else replace(estimate, aligned=aligned)
+    if estimate is None:
+        return None
+    keep = error < options.inlier_px
+    aligned = int(np.count_nonzero(seen.found))
+    return replace(estimate, aligned=aligned, seen=Alignment(seen.xy[keep], seen.found[keep]))
 
 
 def _joined_pose(
@@ -226,11 +231,11 @@ def _refine(
     agreeing: BoolArray,
     camera_from_world: FloatArray,
     options: PoseOptions,
-) -> tuple[Pairs, FloatArray, BundleResult, int]:
+) -> tuple[Pairs, FloatArray, BundleResult, Alignment]:
     """Bundle adjustment; with guided matching once roughly, then again over what matches near its projections.
 
     For that the patches of the keyframes are aligned in the query. Returns the pairs with their errors in pixels,
-    and how many were aligned.
+    and where the query shows each of them.
     Raises numpy.linalg.LinAlgError where the pose is not determined.
     """
     used = pairs.take(agreeing)
@@ -238,7 +243,8 @@ def _refine(
         unaligned = Alignment(query.xy[used.query], np.zeros(len(used), np.bool_))
         adjusted = bundle_adjust(query, keyframes, used, points[agreeing], camera_from_world, options, unaligned)
         projected = project_adjusted(query, keyframes, adjusted)
-        return pairs, projected_error_px(query, pairs, projected), adjusted, 0
+        seen = Alignment(query.xy[pairs.query], np.zeros(len(pairs), np.bool_))
+        return pairs, projected_error_px(query, pairs, projected), adjusted, seen
     adjusted = bundle_adjust(query, keyframes, used, points[agreeing], camera_from_world, options)
     matching = replace(options.matching, guided_radius_px=options.close_radius_px)
     projected = project_adjusted(query, keyframes, adjusted)
@@ -250,8 +256,9 @@ def _refine(
     alignment = align_pairs(query, keyframes, used.query, used.slot, used.keypoint, adjusted, options.threads)
     pose = adjusted.camera_from_world
     adjusted = bundle_adjust(query, keyframes, used, points, pose, options, alignment, start=adjusted)
-    aligned = int(np.count_nonzero(alignment.found))
-    return pairs, projected_error_px(query, pairs, project_adjusted(query, keyframes, adjusted)), adjusted, aligned
+    seen = Alignment(query.xy[pairs.query], np.zeros(len(pairs), np.bool_))
+    seen.xy[agreeing], seen.found[agreeing] = alignment.xy, alignment.found
+    return pairs, projected_error_px(query, pairs, project_adjusted(query, keyframes, adjusted)), adjusted, seen
 
 
 def _project(query: View, keyframes: Sequence[KeyframeView], camera_from_world: FloatArray) -> list[FloatArray]:

@@ -34,7 +34,7 @@ class PointStep:
 
     def compute(self, store: Store, map_id: int, progress: Callable[[int, int], None]) -> list[KeyframePoints]:
         """Raises NotFoundError where a keyframe is deleted meanwhile."""
-        from semdb.refinement.points.overlap import volume_of
+        from semdb.geometry.volumes import volume_of
         from semdb.refinement.points.refined import refine_points
 
         listed = [item.id for item in store.listed_keyframes(map_id)]

@@ -11,14 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from semdb.geometry import invert_pose, pose_error, pose_from, so3_exp, transform_points
+from semdb.geometry.volumes import neighbour_pairs, volume_of
+from semdb.localization.tracks import join_tracks, pairs_of_tracks
 from semdb.localization.views import ClassNumbers, View, make_view
 from semdb.refinement.points.depths import Observations, solve_depths
 from semdb.refinement.points.matching import match_known_poses
 from semdb.refinement.points.options import DepthOptions, FusionOptions, GateOptions, RegistrationOptions
-from semdb.refinement.points.overlap import neighbour_pairs, volume_of
 from semdb.refinement.points.refined import RefinedPoints, refine_points
 from semdb.refinement.points.registration import Sightings, register
-from semdb.refinement.points.tracks import join_tracks, pairs_of_tracks
 from semdb.types import FloatArray, Keypoints
 from tests.unit.localization_scene import CAMERA, Scene
 

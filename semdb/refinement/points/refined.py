@@ -15,13 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from semdb.geometry import invert_pose
+from semdb.geometry.volumes import Volume, neighbour_pairs
+from semdb.localization.tracks import join_tracks, pairs_of_tracks
 from semdb.localization.views import View
 from semdb.refinement.points.depths import Observations, solve_depths
 from semdb.refinement.points.matching import match_known_poses, match_whole_images
 from semdb.refinement.points.options import FusionOptions
-from semdb.refinement.points.overlap import Volume, neighbour_pairs
 from semdb.refinement.points.registration import Sightings, register
-from semdb.refinement.points.tracks import join_tracks, pairs_of_tracks
 from semdb.types import Float32Array, FloatArray, Int64Array, IntArray
 
 

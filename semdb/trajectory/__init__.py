@@ -1,0 +1,1 @@
+"""The trajectory of a recording from its images and depth: tracking, loop closures, pose graph, bundle adjustment."""

@@ -1,0 +1,192 @@
+"""Parts of trajectories: motion, errors, depth that fits, pairs of edges measured both ways, files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from semdb.evaluation.trajectory_errors import rigid_alignment, trajectory_errors
+from semdb.geometry import invert_pose, pose_error, pose_from, so3_exp
+from semdb.geometry.stacks import adjoints
+from semdb.recordings.base import FrameEntry
+from semdb.recordings.synthetic import SyntheticOptions
+from semdb.recordings.synthetic.writer import SyntheticSequence
+from semdb.trajectory.depth_views import depth_agreement, depth_view
+from semdb.trajectory.files import trajectory_text
+from semdb.trajectory.measuring import joined
+from semdb.trajectory.motion import Motion, turn_rates
+from semdb.trajectory.odometry import FrameState
+from semdb.trajectory.recording import RecordedTrajectory
+from semdb.trajectory.result import FramePose, Trajectory
+from semdb.types import FloatArray
+
+
+def turning(times_s: FloatArray, rate: FloatArray, speed: FloatArray) -> FloatArray:
+    """Poses ``[n, 4, 4]`` of a camera that turns and moves evenly in its own frame, for small steps."""
+    poses = [np.eye(4)]
+    for passed in np.diff(times_s):
+        poses.append(poses[-1] @ pose_from(so3_exp(rate * passed), speed * passed))
+    return np.stack(poses)
+
+
+# motion
+
+
+def test_an_even_motion_goes_on() -> None:
+    times = np.array([0.0, 0.1, 0.2, 0.35])
+    rate, speed = np.array([0.1, 0.5, -0.2]), np.array([0.3, 0.0, 0.1])
+    poses = turning(times, rate, speed)
+    motion = Motion(1.0)
+    motion.seen(times[1], poses[1])
+    assert motion.predict(times[2]) is poses[1] or np.array_equal(motion.predict(times[2]), poses[1])
+    motion.seen(times[2], poses[2])
+    predicted = motion.predict(times[3])
+    assert predicted is not None
+    metres, degrees = pose_error(predicted, poses[3])
+    assert metres < 1e-3
+    assert degrees < 0.01
+
+
+def test_a_motion_is_not_believed_for_long() -> None:
+    motion = Motion(1.0)
+    assert motion.predict(0.0) is None
+    motion.seen(0.0, np.eye(4))
+    assert motion.predict(0.9) is not None
+    assert motion.predict(1.1) is None
+    motion.forget()
+    assert motion.predict(0.1) is None
+
+
+def test_a_motion_that_went_elsewhere_is_not_steady() -> None:
+    motion = Motion(1.0)
+    for time_s in (0.0, 0.1, 0.2):
+        motion.seen(time_s, np.eye(4))
+    assert motion.steady
+    motion.seen(0.3, pose_from(so3_exp([0, 0.1, 0]), [0, 0, 0]))
+    assert not motion.steady
+
+
+def test_turn_rates_are_those_of_the_camera() -> None:
+    times = np.array([0.0, 0.05, 0.1, 0.2, 1.5, 1.6])
+    rate = np.array([0.2, -0.6, 0.1])
+    poses = turning(times, rate, np.zeros(3))
+    found = turn_rates(poses[:, :3, :3], times, np.zeros(6, np.int32))
+    np.testing.assert_allclose(found, np.tile(rate, (6, 1)), atol=1e-9)
+    apart = turn_rates(poses[:, :3, :3], times, np.array([0, 0, 0, 0, 0, 1], np.int32))
+    np.testing.assert_array_equal(apart[[4, 5]], 0.0)  # 1.3 s before it, and another world after it
+    assert turn_rates(poses[:1, :3, :3], times[:1], np.zeros(1, np.int32)).tolist() == [[0.0, 0.0, 0.0]]
+
+
+# errors
+
+
+def test_errors_do_not_depend_on_the_world() -> None:
+    times = np.arange(30) / 10
+    true = turning(times, np.array([0.1, 0.4, 0.0]), np.array([0.2, 0.1, 0.3]))
+    world = pose_from(so3_exp([1.0, -0.5, 0.3]), [5, -3, 2])
+    errors = trajectory_errors(world @ true, true, times)
+    assert errors.rmse_m < 1e-9
+    assert errors.relative_rmse_m is not None
+    assert errors.relative_rmse_m < 1e-9
+    assert errors.relative_rmse_deg is not None
+    assert errors.relative_rmse_deg < 1e-6
+
+
+def test_errors_are_what_was_added() -> None:
+    times = np.arange(40) / 10
+    true = turning(times, np.zeros(3), np.array([0.5, 0.0, 0.0]))
+    off = true.copy()
+    off[::2, 1, 3] += 0.02  # to and fro, across the way
+    errors = trajectory_errors(off, true, times)
+    assert errors.rmse_m == pytest.approx(0.01, rel=0.02)
+    assert errors.median_m == pytest.approx(0.01, rel=0.05)
+    assert errors.relative_median_m == pytest.approx(0.0, abs=1e-9)  # a second is ten frames
+    assert errors.frames == 40
+
+
+def test_no_second_no_relative_errors() -> None:
+    true = turning(np.arange(5) / 10, np.zeros(3), np.ones(3))
+    errors = trajectory_errors(true, true, np.arange(5) / 10)
+    assert errors.relative_rmse_m is None
+    with pytest.raises(ValueError, match="three frames"):
+        trajectory_errors(true[:2], true[:2], np.arange(2) / 10)
+
+
+def test_alignment_is_rigid_even_of_a_mirrored_path() -> None:
+    rng = np.random.default_rng(0)
+    positions = rng.normal(size=(20, 3))
+    pose = rigid_alignment(positions, positions * [1, 1, -1])
+    assert np.linalg.det(pose[:3, :3]) == pytest.approx(1.0)
+
+
+# depth
+
+
+@pytest.fixture(scope="module")
+def sequence() -> SyntheticSequence:
+    return SyntheticSequence(SyntheticOptions(frames=12, width=320, height=240, lap_frames=80))
+
+
+def test_depth_fits_the_true_pose_and_no_other(sequence: SyntheticSequence) -> None:
+    first, second = sequence.render(0), sequence.render(4)
+    views = [
+        depth_view(sequence.camera, np.where(f.depth > 0, f.depth, np.nan).astype(np.float32)) for f in (first, second)
+    ]
+    relative = invert_pose(first.world_from_camera) @ second.world_from_camera
+    right = depth_agreement(views[0], views[1], relative)
+    wrong = depth_agreement(views[0], views[1], relative @ pose_from(so3_exp([0, 0.2, 0]), [0.2, 0, 0.1]))
+    assert right is not None
+    assert wrong is not None
+    assert right > 0.7
+    assert wrong < 0.4
+
+
+def test_depth_that_is_not_there_says_nothing(sequence: SyntheticSequence) -> None:
+    frame = sequence.render(0)
+    view = depth_view(sequence.camera, np.where(frame.depth > 0, frame.depth, np.nan).astype(np.float32))
+    assert depth_view(sequence.camera, None) is None
+    assert depth_agreement(view, None, np.eye(4)) is None
+    empty = depth_view(sequence.camera, np.full((240, 320), np.nan, np.float32))
+    assert depth_agreement(view, empty, np.eye(4)) is None
+    behind = pose_from(so3_exp([0, np.pi, 0]), [0, 0, 0])
+    assert depth_agreement(view, view, behind) is None
+
+
+# edges
+
+
+def test_two_ways_that_agree_are_no_surer_than_one() -> None:
+    rng = np.random.default_rng(2)
+    forth = pose_from(so3_exp([0.1, 0.7, -0.2]), [0.5, 0.1, -0.3])
+    spread = np.diag([1e-4] * 3 + [4e-5] * 3)
+    move = adjoints(invert_pose(forth)[None])[0]
+    back_spread = np.linalg.inv(adjoints(invert_pose(forth)[None])[0]) @ spread @ np.linalg.inv(move).T
+    pose, together = joined(forth, spread, invert_pose(forth), back_spread)
+    np.testing.assert_allclose(pose, forth, atol=1e-12)
+    np.testing.assert_allclose(together, spread, rtol=1e-6, atol=1e-12)
+    off = forth @ pose_from(so3_exp(0.01 * rng.normal(size=3)), [0.04, 0, 0])
+    pose, together = joined(forth, spread, invert_pose(off), back_spread)
+    metres, _ = pose_error(pose, forth)
+    assert metres == pytest.approx(0.02, rel=0.05)
+    assert together[0, 0] > spread[0, 0] + 0.0003  # a quarter of the square of what they differ by
+
+
+# files
+
+
+def test_files_have_the_times_of_the_recording() -> None:
+    pose = pose_from(so3_exp([0, 0, np.pi / 2]), [1.0, 2.0, 3.0])
+    frame = FramePose(0, FrameState.TRACKED, piece=0, world_from_camera=pose)
+    trajectory = Trajectory((frame,), (), (), (), (), 0.0, {})
+    entry = FrameEntry(7, "7.png", 1305031229528748000, Path("7.png"), None, None, None)
+    text = trajectory_text(RecordedTrajectory(trajectory, (entry,), True))
+    assert text.splitlines() == [
+        "# estimated poses, world from camera, metres",
+        "# timestamp tx ty tz qx qy qz qw",
+        "1305031229.528748000 1.000000000 2.000000000 3.000000000 0.000000000 0.000000000 0.707106781 0.707106781",
+    ]
+    untimed = trajectory_text(RecordedTrajectory(trajectory, (entry,), False))
+    assert "frame index" in untimed.splitlines()[1]
+    assert untimed.splitlines()[3].startswith("7.000000000 ")
