@@ -9,6 +9,7 @@ from semdb.errors import RecordingError, RecordingUnavailableError, UsageError
 from semdb.recordings import (
     colmap_model,
     icl_nuim,
+    icl_povray,
     kapture,
     nice_slam,
     polycam,
@@ -28,6 +29,7 @@ from semdb.types import Camera
 
 LAYOUTS: tuple[Layout, ...] = (
     icl_nuim.LAYOUT,
+    icl_povray.LAYOUT,
     tum.LAYOUT,
     seven_scenes.LAYOUT,
     stray_scanner.LAYOUT,

@@ -118,6 +118,33 @@ def write_icl(folder: Path, n: int = 5, camera: Camera = SMALL) -> Path:
     return folder
 
 
+def write_povray(folder: Path, n: int = 4, unit: float = 0.01, camera: Camera = SMALL) -> Path:
+    """As POV-Ray rendered the data set: distances along rays and cameras as text, in units of `unit` metres."""
+    folder.mkdir(parents=True)
+    v, u = np.mgrid[: camera.height, : camera.width]
+    rays = back_project(camera, np.column_stack([u.ravel(), v.ravel()]), np.ones(u.size))
+    stretch = np.linalg.norm(rays, axis=1).reshape(v.shape)
+    for i in range(n):
+        image, z = render(camera, icl_pose(i), flip_y=True)
+        stem = f"scene_00_{i:04d}"
+        write_image(folder / f"{stem}.png", image)
+        distance = (z * stretch / unit).ravel()
+        (folder / f"{stem}.depth").write_text(" ".join(f"{value:.6g}" for value in distance) + " \n")
+        x, y, forward, place = icl_pose(i)[:3].T
+        vectors = {
+            "cam_pos": place / unit,
+            "cam_dir": forward,
+            "cam_up": y * camera.height / camera.fy,
+            "cam_lookat": [0, 0, 1],
+            "cam_sky": [0, 1, 0],
+            "cam_right": x * camera.width / camera.fx,
+            "cam_fpoint": [0, 0, 10],
+        }
+        lines = [f"{name:12} = [{', '.join(f'{value:.7g}' for value in vector)}]';" for name, vector in vectors.items()]
+        (folder / f"{stem}.txt").write_text("\n".join([*lines, "cam_angle    = 90;"]) + "\n")
+    return folder
+
+
 def write_seven_scenes(folder: Path, n: int = 2, suffix: str = "png") -> Path:
     """Frames 0, 4, 8, ...; poses written are those of the depth camera, as in the data set."""
     folder.mkdir(parents=True, exist_ok=True)
