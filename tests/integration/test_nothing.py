@@ -18,10 +18,10 @@ from typer.testing import CliRunner
 
 from semdb.cli.main import app
 from semdb.geometry import pose_from, so3_exp
+from semdb.geometry.volumes import volume_of
 from semdb.localization.views import View
 from semdb.recordings.synthetic import SyntheticOptions
 from semdb.refinement.points.options import FusionOptions
-from semdb.refinement.points.overlap import volume_of
 from semdb.refinement.points.refined import refine_points
 from semdb.types import Camera
 from tests.rooms import render
