@@ -26,25 +26,30 @@ def command(
         bool,
         typer.Option("--execute", help="With --accounts or --reader: create them, as the account of the database URL."),
     ] = False,
+    rotate: Annotated[
+        bool,
+        typer.Option("--rotate", help="With --accounts or --reader: new passwords for accounts that are there."),
+    ] = False,
 ) -> None:
     """Create or upgrade the schema; nothing happens when it is there."""
     from semdb.errors import UsageError
 
     settings = overrides.settings()
-    if execute and not (accounts or reader):
-        raise UsageError("--execute goes with --accounts or --reader")
+    for option, given in (("--execute", execute), ("--rotate", rotate)):
+        if given and not (accounts or reader):
+            raise UsageError(f"{option} goes with --accounts or --reader")
     if accounts or reader:
-        _accounts(settings.database_url, execute, only_reader=not accounts)
+        _accounts(settings.database_url, execute, only_reader=not accounts, rotate=rotate)
     else:
         _init(settings)
 
 
-def _accounts(url: str, execute: bool, *, only_reader: bool) -> None:
+def _accounts(url: str, execute: bool, *, only_reader: bool, rotate: bool) -> None:
     """Print statements and URLs as SQL with comments; with `execute` run them and print the URLs only."""
     from semdb.database.accounts import ROLES, plan_accounts
     from semdb.database.accounts import execute as run_statements
 
-    plan = plan_accounts(url, roles=("reader",) if only_reader else ROLES)
+    plan = plan_accounts(url, roles=("reader",) if only_reader else ROLES, rotate=rotate)
     if execute:
         run_statements(url, plan.statements)
         what = (
@@ -52,7 +57,7 @@ def _accounts(url: str, execute: bool, *, only_reader: bool) -> None:
             if only_reader
             else "accounts; nothing else remembers their passwords"
         )
-        print_lines(f"created the {what}:")
+        print_lines(f"{'changed the passwords of' if rotate else 'created'} the {what}:")
     else:
         for statement in plan.statements:
             print_lines(f"{statement};")

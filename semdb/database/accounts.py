@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy import URL, Engine
+from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
 from semdb.database import retry
 from semdb.database.engine import make_server_engine, parse_url
-from semdb.errors import UsageError
+from semdb.errors import DatabaseError, UsageError
 
 ROLES = ("owner", "writer", "reader")
 RIGHTS: Mapping[str, str] = {
@@ -19,13 +21,16 @@ RIGHTS: Mapping[str, str] = {
     "writer": "SELECT, INSERT, UPDATE, DELETE",
     "reader": "SELECT, SHOW VIEW",
 }
+_CANNOT_USER = 1396
+_LONGEST_SCHEMA = 32 - len("_writer")  # in names of accounts, of which MySQL takes 32 characters
+_CREATED = re.compile(r"CREATE USER (\S+) ")
 _NAME = re.compile(r"[A-Za-z0-9_.-]{1,32}")
 _HOST = re.compile(r"[A-Za-z0-9_.:%/-]{1,255}")
 
 
 @dataclass(frozen=True, slots=True)
 class Accounts:
-    """The statements that make the accounts, and the URL of each (with its password)."""
+    """The statements that make the accounts, or give them new passwords, and the URL of each (with its password)."""
 
     statements: tuple[str, ...]
     urls: Mapping[str, str]  # owner, writer, reader
@@ -38,11 +43,13 @@ def plan_accounts(
     passwords: Mapping[str, str] | None = None,
     host: str = "%",
     roles: Sequence[str] = ROLES,
+    rotate: bool = False,
 ) -> Accounts:
     """Accounts for the schema of `url`, of all roles or of `roles`; nothing is executed.
 
-    `names` and `passwords` by role; a name that is not given is ``semdb_<role>``, a password is made up. `host` is
-    where the accounts may connect from. Raises UsageError for SQLite, which has no accounts, and for impossible names.
+    `names` and `passwords` by role; a name that is not given is that of `account_name`, a password is made up. `host`
+    is where the accounts may connect from. With `rotate` they are there and get new passwords. Raises UsageError for
+    SQLite, which has no accounts, and for impossible names.
     """
     parsed = parse_url(url)
     if parsed.get_backend_name() == "sqlite":
@@ -51,38 +58,79 @@ def plan_accounts(
         raise UsageError(f"{host!r} is no host for an account")
     schema = parsed.database or ""
     statements = []
-    if "owner" in roles:
+    if "owner" in roles and not rotate:
         statements.append(
             f"CREATE DATABASE IF NOT EXISTS {_identifier(schema)} CHARACTER SET utf8mb4 COLLATE utf8mb4_bin"
         )
     urls: dict[str, str] = {}
     for role in roles:
-        name = (names or {}).get(role, f"semdb_{role}")
-        password = (passwords or {}).get(role) or secrets.token_urlsafe(18)
+        name = (names or {}).get(role) or account_name(schema, role)
+        password = (passwords or {}).get(role) or _new_password()
         if not _NAME.fullmatch(name):
             raise UsageError(f"{name!r} cannot be the name of an account: 1 to 32 of A-Z a-z 0-9 _ . -")
         account = f"'{name}'@'{host}'"
-        statements.append(f"CREATE USER {account} IDENTIFIED BY {_quoted(password)}")
-        # _ and % in the schema of a GRANT are patterns
-        pattern = _identifier(re.sub(r"([_%])", r"\\\1", schema))
-        statements.append(f"GRANT {RIGHTS[role]} ON {pattern}.* TO {account}")
+        statements.append(f"{'ALTER' if rotate else 'CREATE'} USER {account} IDENTIFIED BY {_quoted(password)}")
+        if not rotate:
+            # _ and % in the schema of a GRANT are patterns
+            pattern = _identifier(re.sub(r"([_%])", r"\\\1", schema))
+            statements.append(f"GRANT {RIGHTS[role]} ON {pattern}.* TO {account}")
         urls[role] = parsed.set(username=name, password=password).render_as_string(hide_password=False)
     return Accounts(tuple(statements), urls)
 
 
+def account_name(schema: str, role: str) -> str:
+    """The name of the account of a role for a schema, which no other schema's account has: ``semdb_reader``.
+
+    Names of schemas that are too long, or have characters that names here have not, are told apart by their hash.
+    """
+    plain = re.sub(r"[^A-Za-z0-9_.-]", "_", schema)
+    if plain != schema or len(plain) > _LONGEST_SCHEMA:
+        plain = f"{plain[: _LONGEST_SCHEMA - 9]}_{hashlib.sha256(schema.encode()).hexdigest()[:8]}"
+    return f"{plain}_{role}"
+
+
+def _new_password() -> str:
+    """24 random characters, and of every kind that a server may ask for."""
+    return secrets.token_urlsafe(18) + "-0aA"
+
+
 def execute(url: str, statements: Sequence[str]) -> None:
-    """Run the statements as the account of `url`, which must be allowed to. Raises DatabaseError."""
+    """Run the statements as the account of `url`, which must be allowed to. Raises DatabaseError.
+
+    When one fails, the accounts that those before it made are gone again: nobody would know their passwords.
+    """
     parsed = parse_url(url)
-    engine = make_server_engine(parsed.set(database=None))  # the schema may be what they make
+    place = {"host": parsed.host, "port": parsed.port, "query": parsed.query}
+    # without the schema, which may be what they make
+    engine = make_server_engine(URL.create(parsed.drivername, parsed.username, parsed.password, **place))
+    made: list[str] = []
     try:
         with engine.connect() as connection:
             for statement in statements:
-                connection.exec_driver_sql(statement.replace("%", "%%"))
+                try:
+                    connection.exec_driver_sql(statement.replace("%", "%%"))
+                except DBAPIError as error:
+                    for account in made:
+                        connection.exec_driver_sql(f"DROP USER {account}".replace("%", "%%"))
+                    raise _refused(engine, error, statement) from error
+                if created := _CREATED.match(statement):
+                    made.append(created[1])
             connection.commit()
     except SQLAlchemyError as error:
         raise retry.explain(engine, error) from error
     finally:
         engine.dispose()
+
+
+def _refused(engine: Engine, error: DBAPIError, statement: str) -> DatabaseError:
+    if retry.error_code(error) != _CANNOT_USER:
+        return retry.explain(engine, error)
+    account = statement.split()[2]
+    if statement.startswith("CREATE"):
+        return DatabaseError(
+            f"the account {account} is there already, and nothing was made: --rotate gives it a new password"
+        )
+    return DatabaseError(f"there is no account {account}: leave out --rotate to make it")
 
 
 def _identifier(name: str) -> str:
