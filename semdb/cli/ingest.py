@@ -186,6 +186,14 @@ def blank_text(frames: Sequence[int]) -> list[str]:
     ]
 
 
+def _described(summary: IngestSummary) -> list[str]:
+    """A line where something was described now: of what was stored before, `semdb status` tells."""
+    if not summary.stored:
+        return []
+    count = f"{summary.stored} keyframes" if summary.stored > 1 else "the keyframe"
+    return [f"objects    {summary.objects}, and {summary.keypoints} keypoints, in {count} stored now"]
+
+
 def as_lines(summary: IngestSummary) -> list[str]:
     """What is printed for people."""
     from semdb.cli.recording import group_dropped
@@ -204,7 +212,7 @@ def as_lines(summary: IngestSummary) -> list[str]:
         *(f"           frame {index}: {reason}" for index, reason in summary.failed.items()),
         *(f"           {line}" for line in blank_text(summary.blank)),
         *(f"look at    {line}" for line in group_dropped(summary.remarks)),
-        f"objects    {summary.objects} with {summary.keypoints} keypoints in all",
+        *_described(summary),
         f"models     {', '.join(model.name for model in summary.models)}",
         f"seconds    {seconds['total']:.1f}{rate}; selection {seconds['select']:.1f}; {stages}",
     ]

@@ -8,7 +8,7 @@ import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from sqlalchemy import URL, Engine
+from sqlalchemy import URL, Connection, Engine
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
 from semdb.database import retry
@@ -97,24 +97,24 @@ def _new_password() -> str:
 def execute(url: str, statements: Sequence[str]) -> None:
     """Run the statements as the account of `url`, which must be allowed to. Raises DatabaseError.
 
-    When one fails, the accounts that those before it made are gone again: nobody would know their passwords.
+    When one fails, the accounts that those before it made are gone again: nobody would know their passwords. New
+    passwords of accounts that were there cannot be taken back: the error holds those that were given.
     """
     parsed = parse_url(url)
-    place = {"host": parsed.host, "port": parsed.port, "query": parsed.query}
+    who = (parsed.drivername, parsed.username, parsed.password)
     # without the schema, which may be what they make
-    engine = make_server_engine(URL.create(parsed.drivername, parsed.username, parsed.password, **place))
-    made: list[str] = []
+    engine = make_server_engine(URL.create(*who, host=parsed.host, port=parsed.port, query=parsed.query))
+    done: list[str] = []
     try:
         with engine.connect() as connection:
             for statement in statements:
                 try:
-                    connection.exec_driver_sql(statement.replace("%", "%%"))
+                    _run(connection, statement)
                 except DBAPIError as error:
-                    for account in made:
-                        connection.exec_driver_sql(f"DROP USER {account}".replace("%", "%%"))
-                    raise _refused(engine, error, statement) from error
-                if created := _CREATED.match(statement):
-                    made.append(created[1])
+                    for made in filter(None, map(_CREATED.match, done)):
+                        _run(connection, f"DROP USER {made[1]}")
+                    raise _refused(engine, error, statement, done) from error
+                done.append(statement)
             connection.commit()
     except SQLAlchemyError as error:
         raise retry.explain(engine, error) from error
@@ -122,15 +122,21 @@ def execute(url: str, statements: Sequence[str]) -> None:
         engine.dispose()
 
 
-def _refused(engine: Engine, error: DBAPIError, statement: str) -> DatabaseError:
-    if retry.error_code(error) != _CANNOT_USER:
-        return retry.explain(engine, error)
-    account = statement.split()[2]
-    if statement.startswith("CREATE"):
-        return DatabaseError(
-            f"the account {account} is there already, and nothing was made: --rotate gives it a new password"
+def _run(connection: Connection, statement: str) -> None:
+    connection.exec_driver_sql(statement.replace("%", "%%"))
+
+
+def _refused(engine: Engine, error: DBAPIError, statement: str, done: Sequence[str]) -> DatabaseError:
+    explained = retry.explain(engine, error)
+    if retry.error_code(error) == _CANNOT_USER:
+        account = statement.split()[2]
+        explained = DatabaseError(
+            f"the account {account} is there already, and no account was made: --rotate gives it a new password"
+            if statement.startswith("CREATE")
+            else f"there is no account {account}, whose password could be changed: leave out --rotate to make it"
         )
-    return DatabaseError(f"there is no account {account}: leave out --rotate to make it")
+    changed = "; ".join(before for before in done if before.startswith("ALTER"))
+    return DatabaseError(f"{explained}. Changed before that: {changed}") if changed else explained
 
 
 def _identifier(name: str) -> str:

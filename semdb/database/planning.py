@@ -148,6 +148,8 @@ class StoredPlan:
     recording_id: int
     map_id: int
     source: str
+    format: str
+    frame_count: int
     fingerprint: str
     frame_indexes: tuple[int, ...]  # ascending, those of deleted keyframes too
 
@@ -166,11 +168,26 @@ def stored_plan(engine: Engine, recording_id: int) -> StoredPlan:
             row.id,
             row.map_id,
             checked.text(row.source, f"recordings.source {where}", checked.MOST_JSON),
+            checked.text(row.format, f"recordings.format {where}"),
+            checked.integer(row.frame_count, f"recordings.frame_count {where}"),
             checked.text(row.fingerprint, f"recordings.fingerprint {where}", 64),
             tuple(checked.integer(index, f"ingest_items.frame_index {where}") for index in indexes),
         )
 
     return retry.read(engine, work)
+
+
+def find_plan(engine: Engine, map_name: str, recording: str) -> StoredPlan | None:
+    """The plan of a recording of a map by their names; None where there is none, or it is being deleted."""
+    query = select(recordings.c.id).join(maps, maps.c.id == recordings.c.map_id)
+    query = query.where(maps.c.name == map_name, recordings.c.name == recording)
+    key = retry.read(engine, lambda c: c.execute(query).scalar())
+    if key is None:
+        return None
+    try:
+        return stored_plan(engine, key)
+    except NotFoundError:
+        return None
 
 
 def _check_plan(plan: RecordingPlan, infos: Sequence[ModelInfo]) -> None:
@@ -213,13 +230,15 @@ def _resume(connection: Connection, row: Row[Any], plan: RecordingPlan, map_name
     ):
         if not same:
             raise UsageError(f"{name} is stored already and is another one: its {what} is {old}, not {new}; {advice}")
-    if row.fingerprint != plan.fingerprint:
-        raise UsageError(
-            f"{name} is stored already and is another one: its camera, or which frames can be used, their times or "
-            f"their poses are others now; {advice}"
-        )
-    query = select(ingest_items.c.frame_index, ingest_items.c.state).where(ingest_items.c.recording_id == row.id)
     where = f"of recording {row.id}"
+    query = select(ingest_items.c.frame_index, ingest_items.c.state).where(ingest_items.c.recording_id == row.id)
+    if plan.extends and row.fingerprint == plan.extends:
+        _extend(connection, row.id, plan, set(connection.execute(query).scalars()))
+    elif row.fingerprint != plan.fingerprint:
+        raise UsageError(
+            f"{name} is stored already and is another one: which keyframes it has, its camera, or their times or poses "
+            f"are others; {advice}"
+        )
     states = {
         checked.integer(index, f"ingest_items.frame_index {where}"): state
         for index, state in connection.execute(query.order_by(ingest_items.c.frame_index))
@@ -240,6 +259,22 @@ def _resume(connection: Connection, row: Row[Any], plan: RecordingPlan, map_name
         tuple(index for index, state in states.items() if state == ItemState.DONE),
         tuple(index for index, state in states.items() if state == ItemState.FAILED),
     )
+
+
+def _extend(connection: Connection, recording_id: int, plan: RecordingPlan, there: set[int]) -> None:
+    """More keyframes for a plan that is as `plan` takes it to be; nothing where another process was faster."""
+    values = {
+        "fingerprint": plan.fingerprint,
+        "frame_count": plan.frame_count,
+        "state": RecordingState.INGESTING.value,
+        "finished_at": None,
+    }
+    as_it_was = (recordings.c.id == recording_id, recordings.c.fingerprint == plan.extends)
+    if connection.execute(update(recordings).where(*as_it_was).values(values)).rowcount != 1:
+        return
+    item = {"recording_id": recording_id, "state": ItemState.PENDING.value, "attempts": 0}
+    added = sorted(set(plan.frame_indexes) - there)
+    connection.execute(insert(ingest_items), [{**item, "frame_index": index} for index in added])
 
 
 def _few(indexes: Sequence[int]) -> str:

@@ -57,7 +57,10 @@ class MapHead:
 
 @dataclass(frozen=True, slots=True)
 class RecordingPlan:
-    """What is to be ingested. `fingerprint` (at most 64 characters) tells recordings of one name apart."""
+    """What is to be ingested. `fingerprint` (at most 64 characters) tells recordings of one name apart.
+
+    `extends` is that of the stored plan to which this one adds keyframes.
+    """
 
     name: str
     format: str
@@ -65,6 +68,7 @@ class RecordingPlan:
     frame_count: int
     fingerprint: str
     frame_indexes: tuple[int, ...]  # of the keyframes
+    extends: str = ""
 
 
 @dataclass(frozen=True, slots=True)

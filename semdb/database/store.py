@@ -322,6 +322,10 @@ class Store:
         """Frame indexes of the stored plan of a recording, ascending; empty where there is none."""
         return lookups.planned_frames(self.engine, map_name, recording)
 
+    def find_plan(self, map_name: str, recording: str) -> planning.StoredPlan | None:
+        """The stored plan of a recording of a map; None where there is none."""
+        return planning.find_plan(self.engine, map_name, recording)
+
     def cameras(self, map_id: int) -> list[Camera]:
         """The different cameras of a map's keyframes; what is none is said, and left out, where somebody listens."""
         return lookups.map_cameras(self.engine, map_id, self.say)

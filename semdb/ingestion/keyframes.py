@@ -25,6 +25,7 @@ def select_keyframes(
     *,
     count: int | None = None,
     stride: int | None = None,
+    keep: Sequence[FrameEntry] = (),
     min_overlap: float = MIN_OVERLAP,
     progress: Progress | None = None,
 ) -> list[FrameEntry]:
@@ -32,8 +33,10 @@ def select_keyframes(
 
     With `count` exactly that many: each next one is the frame whose greatest common view with the chosen ones is
     least. With `stride` every stride-th frame. With neither, as many as it takes until every frame has a common
-    view of at least `min_overlap` with some keyframe. Frames without a pose are never keyframes; frames whose
-    depth cannot be decoded go to ``recording.decode_failures``. `progress` gets (frames read, frames).
+    view of at least `min_overlap` with some keyframe. `keep`, but for a stride, are keyframes already: they are among
+    those that are returned, and the others are chosen by what they have in common with these. Frames without a pose are
+    never keyframes; frames whose depth cannot be decoded go to ``recording.decode_failures``. `progress` gets (frames
+    read, frames).
     Raises UsageError for a count or stride that makes no sense, RecordingError when no frame has a pose.
     """
     if count is not None and stride is not None:
@@ -48,21 +51,31 @@ def select_keyframes(
     if stride is not None:
         return entries[::stride]
     entries, overlap_with = _compare_views(recording, entries, progress)
-    if count is not None and count > len(entries):
+    kept = {entry.index for entry in keep}
+    lost = [entry for entry in keep if entry.index not in {other.index for other in entries}]
+    if count is not None and count > len(entries) + len(lost):
         raise UsageError(
-            f"{recording.path}: {count} keyframes were asked for, but only {len(entries)} frames can be used"
+            f"{recording.path}: {count} keyframes were asked for, but only "
+            f"{len(entries) + len(lost)} frames can be used"
         )
     if not entries:
         raise RecordingError(f"{recording.path}: no depth image can be decoded")
     poses = np.stack([entry.world_from_camera for entry in entries if entry.world_from_camera is not None])
-    chosen = farthest_views(overlap_with, poses, count=count, min_overlap=min_overlap)
-    return [entries[i] for i in sorted(chosen.tolist())]
+    first = [i for i, entry in enumerate(entries) if entry.index in kept] or [0]
+    left = None if count is None else count - len(lost)
+    chosen = farthest_views(overlap_with, poses, count=left, first=first, min_overlap=min_overlap)
+    return sorted([*lost, *(entries[i] for i in chosen.tolist())], key=lambda entry: entry.index)
 
 
 def farthest_views(
-    overlap_with: OverlapWith, poses: FloatArray, *, count: int | None, min_overlap: float = MIN_OVERLAP
+    overlap_with: OverlapWith,
+    poses: FloatArray,
+    *,
+    count: int | None,
+    first: Sequence[int] = (0,),
+    min_overlap: float = MIN_OVERLAP,
 ) -> IntArray:
-    """Indices of views in the order they are chosen, the first view first.
+    """Indices of views in the order they are chosen, `first` first, which are no more than `count`.
 
     ``overlap_with(i, floor)`` gives the common view ``[n]`` of all with view i (values up to `floor` need not be
     exact). Of views with equally little in common with the chosen ones the farthest in pose ``[n, 4, 4]`` is
@@ -72,15 +85,14 @@ def farthest_views(
     greatest = np.full(n, -1.0)
     distance = np.full(n, np.inf)
     chosen: list[int] = []
-    current = 0
     while True:
+        current = first[len(chosen)] if len(chosen) < len(first) else int(np.lexsort((-distance, greatest))[0])
         chosen.append(current)
         greatest = np.maximum(greatest, overlap_with(current, greatest))
         greatest[current] = np.inf
         distance = np.minimum(distance, pose_distances(poses[current], poses))
         if len(chosen) == (n if count is None else count) or (count is None and greatest.min() >= min_overlap):
             return np.array(chosen, dtype=np.int32)
-        current = int(np.lexsort((-distance, greatest))[0])
 
 
 def overlap_from_pose_distance(distance: FloatArray, min_overlap: float = MIN_OVERLAP) -> FloatArray:

@@ -17,11 +17,11 @@ from semdb.database.planning import StoredPlan, check_models, stored_plan
 from semdb.database.requeue import requeue_failed
 from semdb.database.store import Store, open_store
 from semdb.errors import ModelError, NotFoundError, RecordingError, RecordingUnavailableError, UsageError
+from semdb.ingestion.plan import fingerprint
 from semdb.ingestion.run import (
     IngestOptions,
     IngestSummary,
     Progress,
-    fingerprint,
     keep_findings,
     look_first,
     make_describers,

@@ -6,7 +6,6 @@ that is cut off anywhere is finished by running it again. `semdb.ingestion.work`
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -22,7 +21,7 @@ from semdb.database.requeue import requeue_failed
 from semdb.database.store import Store, open_store
 from semdb.errors import UsageError
 from semdb.ingestion.contradictions import check_before_ingest
-from semdb.ingestion.keyframes import select_keyframes
+from semdb.ingestion.plan import Choice, choose_keyframes, fingerprint
 from semdb.ingestion.work import STAGES, Item, log_item, work_off
 from semdb.names import storable
 from semdb.perception.describe import Describer, describer_from_specs
@@ -285,15 +284,20 @@ def plan_ingest(
     map_name = options.map_of(recording)
     check_models(map_models_of(store, map_name), models, f"the map {map_name!r}")
     if entries is None:
-        entries = _planned_entries(recording, store, map_name, options, progress)
-    plan = _plan(recording, store, map_name, models, entries)
+        report = None if progress is None else partial(progress, f"selecting keyframes of {recording.name}")
+        choice = choose_keyframes(
+            recording, store, map_name, count=options.keyframes, stride=options.stride, progress=report
+        )
+    else:
+        choice = Choice(entries)
+    plan = _plan(recording, store, map_name, models, choice)
     summary = IngestSummary(
         map_name=map_name,
         recording=recording.name,
         recording_id=plan.recording_id,
         total_frames=recording.total_frames,
         usable_frames=len(recording.entries) - len(recording.decode_failures),
-        planned=len(entries),
+        planned=len(choice.entries),
         already_stored=len(plan.stored),
         models=models,
         dropped=(*recording.dropped, *recording.decode_failures),
@@ -332,50 +336,17 @@ def map_models_of(store: Store, map_name: str) -> tuple[ModelInfo, ...]:
     return ()
 
 
-def fingerprint(recording: Recording, keyframes: Sequence[FrameEntry]) -> str:
-    """SHA-256 over format, camera and the keyframes' names, times and poses: tells recordings of one name apart.
-
-    Other frames are not in it, so a recording whose broken files were mended is still the same one.
-    """
-    digest = hashlib.sha256(f"{recording.format}|{recording.camera}|{recording.depth_scale}".encode())
-    for entry in keyframes:
-        digest.update(f"|{entry.index}|{entry.name}|{entry.timestamp_ns}".encode(errors="surrogateescape"))
-        if entry.camera is not None:
-            digest.update(f"|{entry.camera}".encode())
-        if entry.world_from_camera is not None:
-            digest.update(entry.world_from_camera.astype("<f8").tobytes())
-    return digest.hexdigest()
-
-
-def _planned_entries(
-    recording: Recording, store: Store, map_name: str, options: IngestOptions, progress: Progress | None
-) -> list[FrameEntry]:
-    """The keyframes to be: those of the stored plan where one is being resumed, else a new selection."""
-    if options.keyframes is None and options.stride is None:
-        stored = store.planned_frames(map_name, recording.name)
-        if stored:
-            known = {entry.index: entry for entry in recording.entries}
-            missing = [index for index in stored if index not in known]
-            if not missing:
-                return [known[index] for index in stored]
-
-    def report(done: int, total: int) -> None:
-        if progress is not None:
-            progress(f"selecting keyframes of {recording.name}", done, total)
-
-    return select_keyframes(recording, count=options.keyframes, stride=options.stride, progress=report)
-
-
 def _plan(
-    recording: Recording, store: Store, map_name: str, models: tuple[ModelInfo, ...], entries: Sequence[FrameEntry]
+    recording: Recording, store: Store, map_name: str, models: tuple[ModelInfo, ...], choice: Choice
 ) -> PlannedRecording:
     plan = RecordingPlan(
         name=recording.name,
         format=recording.format,
         source=recording.source or str(recording.path.absolute()),
         frame_count=recording.total_frames,
-        fingerprint=fingerprint(recording, entries),
-        frame_indexes=tuple(entry.index for entry in entries),
+        fingerprint=fingerprint(recording, choice.entries),
+        frame_indexes=tuple(entry.index for entry in choice.entries),
+        extends=choice.extends,
     )
     return store.plan_recording(store.ensure_map(map_name), plan, models)
 

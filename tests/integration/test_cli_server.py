@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -60,6 +61,58 @@ def test_each_account_does_its_work_and_no_more(accounts: dict[str, str], monkey
 
     assert run("delete", "recording", "first visit", "--yes").stdout.endswith("5 keyframes\n")
     assert json.loads(run("status", "--json").stdout) == []
+
+
+def test_passwords_are_rotated(
+    accounts: dict[str, str], server_url: str, database_server: TestServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The old ones end; where an account is missing, what was changed before is not lost."""
+    run("init", "--database-url", accounts["owner"])
+    output = run("init", "--accounts", "--execute", "--rotate", "--database-url", server_url).stdout
+    assert output.startswith("changed the passwords of the accounts; nothing else remembers their passwords:\n")
+    rotated = {line.split()[0]: line.split()[-1] for line in output.splitlines()[1:]}
+    for role, url in rotated.items():
+        old, new = make_url(accounts[role]), make_url(url)
+        assert (old.username, old.database) == (new.username, new.database)
+        assert old.password != new.password
+    monkeypatch.setenv("SEMDB_DATABASE_URL", rotated["writer"])
+    assert json.loads(run("status", "--json").stdout) == []
+    assert "check user, password" in run("status", "--database-url", accounts["writer"], code=1).stderr
+
+    reader = make_url(rotated["reader"]).username
+    database_server.execute(f"DROP USER '{reader}'@'%'")
+    refused = run("init", "--accounts", "--execute", "--rotate", "--database-url", server_url, code=1).stderr
+    flat = " ".join(refused.split())
+    assert f"there is no account '{reader}'@'%', whose password could be changed: leave out --rotate" in flat
+    changed = re.findall(r"ALTER USER '(\S+)'@'%' IDENTIFIED BY '(\S+)'", flat)
+    assert [name for name, _ in changed] == [make_url(rotated[role]).username for role in ("owner", "writer")]
+    writer = make_url(rotated["writer"]).set(password=changed[1][1]).render_as_string(hide_password=False)
+    assert json.loads(run("status", "--json", "--database-url", writer).stdout) == []
+    run("init", "--reader", "--execute", "--database-url", server_url)
+
+
+def test_accounts_of_several_schemas_and_of_one_that_is_not_there_yet(database_server: TestServer) -> None:
+    """None is left behind of a run that a later statement ends."""
+    names = [f"semdb_{os.getpid()}_{n}" for n in (1, 2)]
+    urls = [database_server.admin.set(database=name).render_as_string(hide_password=False) for name in names]
+    try:
+        for url in urls:
+            output = run("init", "--accounts", "--execute", "--database-url", url).stdout
+            owner = next(line.split()[-1] for line in output.splitlines() if line.startswith("owner"))
+            assert "created the schema" in run("init", "--database-url", owner).stdout
+        again = " ".join(run("init", "--accounts", "--execute", "--database-url", urls[0], code=1).stderr.split())
+        assert f"'{names[0]}_owner'@'%' is there already, and no account was made: --rotate" in again
+
+        database_server.execute(*(f"DROP USER '{names[1]}_{role}'@'%'" for role in ("owner", "writer")))
+        run("init", "--accounts", "--execute", "--database-url", urls[1], code=1)  # the reader is there
+        users = database_server.execute(f"SELECT user FROM mysql.user WHERE user LIKE '{names[1]}%'")
+        assert [str(user) for (user,) in users] == [f"{names[1]}_reader"]
+    finally:
+        for name in names:
+            database_server.execute(f"DROP DATABASE IF EXISTS `{name}`")
+            database_server.execute(
+                *(f"DROP USER IF EXISTS '{name}_{role}'@'%'" for role in ("owner", "writer", "reader"))
+            )
 
 
 def test_doctor_names_the_server_and_a_missing_schema(

@@ -205,8 +205,9 @@ def test_the_command_that_the_error_names_makes_a_reader(database_server: TestSe
     assert named[-1] == admin.set(username="ADMIN", password="PASSWORD", query={}).render_as_string(hide_password=False)
     try:
         printed = semdb("init", "--reader", url=server_url).stdout
-        assert printed.startswith("CREATE USER 'semdb_reader'@'%'")
-        assert "semdb_writer" not in printed
+        account = accounts.account_name(str(admin.database), "reader")
+        assert printed.startswith(f"CREATE USER '{account}'@'%'")
+        assert "_writer" not in printed
         made = semdb("init", *named[:-1], server_url, url="sqlite:///nothing.sqlite3")
         assert made.returncode == 0, made.stderr
         assert made.stdout.startswith(
@@ -220,7 +221,7 @@ def test_the_command_that_the_error_names_makes_a_reader(database_server: TestSe
             assert known[table.name] == tuple(column.name for column in table.columns)
         assert "category" in known["keyframe_objects"]
     finally:
-        database_server.execute("DROP USER IF EXISTS 'semdb_reader'@'%'")
+        database_server.execute(f"DROP USER IF EXISTS '{accounts.account_name(str(admin.database), 'reader')}'@'%'")
 
 
 @pytest.mark.parametrize(
@@ -317,3 +318,20 @@ def test_accounts_that_cannot_be_made(tmp_path: Path) -> None:
     made = accounts.plan_accounts(url, passwords=dict.fromkeys(accounts.ROLES, "p'w"))
     assert made.statements[1] == "CREATE USER 'semdb_owner'@'%' IDENTIFIED BY 'p''w'"
     assert made.statements[-1] == "GRANT SELECT, SHOW VIEW ON `semdb`.* TO 'semdb_reader'@'%'"
+
+
+@pytest.mark.parametrize(
+    ("schema", "name"),
+    [
+        ("semdb", "semdb_reader"),
+        ("maps", "maps_reader"),
+        ("a" * 25, "a" * 25 + "_reader"),
+        ("a" * 26, "a" * 16 + "_9976d549_reader"),
+        ("maps/1", "maps_1_bc366e61_reader"),
+        ("karten von köln", "karten_von_k_ln_043dacd5_reader"),
+    ],
+)
+def test_accounts_are_named_after_the_schema(schema: str, name: str) -> None:
+    """Within the 32 characters that MySQL takes, whatever the schema is called."""
+    assert accounts.account_name(schema, "reader") == name
+    assert {len(accounts.account_name("m" * n, "writer")) <= 32 for n in range(1, 65)} == {True}

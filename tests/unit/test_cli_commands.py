@@ -339,15 +339,26 @@ def test_accounts_are_printed_as_sql() -> None:
     statements = [line for line in output.splitlines() if not line.startswith("-- ")]
     assert statements[0].startswith("CREATE DATABASE IF NOT EXISTS `maps`")
     assert [line.split("'")[1] for line in statements if line.startswith("CREATE USER")] == [
-        "semdb_owner",
-        "semdb_writer",
-        "semdb_reader",
+        "maps_owner",
+        "maps_writer",
+        "maps_reader",
     ]
-    assert "GRANT SELECT, SHOW VIEW ON `maps`.* TO 'semdb_reader'@'%';" in statements
+    assert "GRANT SELECT, SHOW VIEW ON `maps`.* TO 'maps_reader'@'%';" in statements
     urls = {line.split()[1]: line.split()[-1] for line in output.splitlines() if line.startswith("-- ")}
     assert set(urls) == {"owner", "writer", "reader"}
-    assert urls["reader"].startswith("mysql+pymysql://semdb_reader:")
+    assert urls["reader"].startswith("mysql+pymysql://maps_reader:")
     assert "known.to.nobody" not in output  # with a character that no generated password has
 
     assert "SQLite has no accounts" in run("init", "--accounts", code=2).stderr
     assert "--execute goes with --accounts" in run("init", "--execute", code=2).stderr
+    assert "--rotate goes with --accounts" in run("init", "--rotate", code=2).stderr
+
+
+def test_new_passwords_are_printed_as_sql() -> None:
+    """No right and no schema is made again."""
+    arguments = ("init", "--accounts", "--rotate", "--database-url", "mysql+pymysql://root:x@127.0.0.1:9/maps")
+    lines = run(*arguments).stdout.splitlines()
+    assert [line.split()[:3] for line in lines[:3]] == [
+        ["ALTER", "USER", f"'maps_{role}'@'%'"] for role in ("owner", "writer", "reader")
+    ]
+    assert all(line.startswith("-- ") for line in lines[3:])

@@ -98,6 +98,13 @@ def test_farthest_views_of_a_line() -> None:
     assert sorted(farthest_views(stack.overlap_with, poses, count=11).tolist()) == list(range(11))
 
 
+def test_farthest_views_beside_those_that_are_there() -> None:
+    poses = np.stack([at(x=0.1 * i) for i in range(11)])
+    stack = ViewStack([view_grid(CAMERA, wall())] * 11, list(poses))
+    assert farthest_views(stack.overlap_with, poses, count=4, first=[3, 5]).tolist() == [3, 5, 10, 0]
+    assert farthest_views(stack.overlap_with, poses, count=2, first=[9, 1]).tolist() == [9, 1]
+
+
 def test_without_a_count_every_view_shares_enough_with_a_keyframe() -> None:
     poses = np.stack([at(x=0.1 * i, turn_deg=3 * i) for i in range(40)])
     stack = ViewStack([view_grid(CAMERA, wall())] * 40, list(poses))
@@ -159,6 +166,12 @@ def test_frames_without_pose_or_with_broken_depth_are_no_keyframes(tmp_path: Pat
     assert [failure.name for failure in recording.decode_failures] == ["rgb/100.200000.png"]
     with pytest.raises(UsageError, match="4 keyframes were asked for, but only 3 frames can be used"):
         select_keyframes(recording, count=4)
+    kept = [entry for entry in recording.entries if entry.index in (1, 2)]  # also one whose file broke meanwhile
+    again = open_recording(folder)
+    assert [entry.index for entry in select_keyframes(again, count=3, keep=kept)] == [1, 2, 3]
+    assert [entry.index for entry in select_keyframes(again, count=4, keep=kept)] == [0, 1, 2, 3]
+    with pytest.raises(UsageError, match="5 keyframes were asked for, but only 4 frames can be used"):
+        select_keyframes(again, count=5, keep=kept)
     (folder / "groundtruth.txt").unlink()
     with pytest.raises(RecordingError, match="no frame has a pose"):
         select_keyframes(open_recording(folder), count=1)
