@@ -162,6 +162,7 @@ def print_summary(found: RecordedTrajectory, recording: Recording, seconds: floa
         ),
         *(("", line) for line in refused(found)),
         ("path", f"{measure(told['length_m'], 2)} m"),
+        ("world", world_of(found)),
         ("time", f"{measure(told['seconds_per_frame'], 3)} s per frame, {measure(seconds, 1)} s in all"),
     ]
     if not found.timed:
@@ -173,6 +174,14 @@ def print_summary(found: RecordedTrajectory, recording: Recording, seconds: floa
             for piece in pieces
         ]
     print_lines(*(f"{label:<13} {text}" for label, text in lines))
+
+
+def world_of(found: RecordedTrajectory) -> str:
+    """Which way the axes of the world point."""
+    up = found.trajectory.up
+    if up is None:
+        return "axes of the first keyframe: which way is up cannot be told"
+    return f"z up, as surfaces tell it, to {measure(up.sigma_deg, 1)} deg; origin and x of the first keyframe"
 
 
 def refused(found: RecordedTrajectory) -> list[str]:

@@ -14,6 +14,7 @@ from semdb.trajectory.edges import Edge, EdgeState
 from semdb.trajectory.odometry import FrameState
 from semdb.trajectory.recording import RecordedTrajectory
 from semdb.trajectory.result import FramePose
+from semdb.trajectory.upright import Up
 from semdb.types import FloatArray
 
 
@@ -48,6 +49,7 @@ def summary(found: RecordedTrajectory, seconds: float) -> dict[str, Any]:
         "left_out": trajectory.count(FrameState.LEFT_OUT),
         "keyframes": len(trajectory.keyframes),
         "length_m": path_length(used),
+        "upright": None if trajectory.up is None else _up(trajectory.up),
         "readout_s": trajectory.readout_s,
         "seconds": seconds,
         "seconds_per_frame": seconds / max(frames, 1),
@@ -58,6 +60,7 @@ def summary(found: RecordedTrajectory, seconds: float) -> dict[str, Any]:
                 "keyframes": piece.keyframes,
                 "first": _index(found.entries, piece.first_position),
                 "last": _index(found.entries, piece.last_position),
+                "upright": None if piece.up is None else _up(piece.up),
             }
             for piece in trajectory.pieces
         ],
@@ -92,6 +95,10 @@ def path_length(poses: Sequence[FloatArray]) -> float:
 
 def _index(entries: Sequence[FrameEntry], position: int) -> int:
     return entries[position].index
+
+
+def _up(up: Up) -> dict[str, float]:
+    return {"sigma_deg": up.sigma_deg, "share": up.share}
 
 
 def _edge(edge: Edge, found: RecordedTrajectory) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from semdb.trajectory.placing import place_again
 from semdb.trajectory.pose_graph import edge_chi2, marginal_covariances
 from semdb.trajectory.result import Drift, FramePose, PieceSummary, Trajectory
 from semdb.trajectory.solving import Solution
+from semdb.trajectory.upright import Up, find_up, level_world
 from semdb.types import FloatArray
 
 CHI2_MEDIAN = 5.348  # of six numbers
@@ -44,11 +46,12 @@ def finish(
         frames.append(_frame_of(odometry, track, solution, numbers, spread, before, rates, options))
         if progress is not None:
             progress("placing frames", done, len(odometry.tracks))
+    frames, ups = _upright(odometry, frames) if options.upright else (frames, {})
     return Trajectory(
         frames=tuple(frames),
         keyframes=tuple(keyframe.position for keyframe in odometry.keyframes.all),
         edges=tuple(edges),
-        pieces=_pieces(frames, numbers),
+        pieces=_pieces(frames, numbers, ups),
         drifts=tuple(_drift(edge, before) for edge in edges if _closes(edge)),
         readout_s=solution.readout_s,
         timing_s=dict(timing_s),
@@ -122,13 +125,40 @@ def _rotated(covariance: FloatArray, rotation: FloatArray) -> FloatArray:
     return (turned + turned.T) / 2
 
 
-def _pieces(frames: Sequence[FramePose], numbers: Mapping[int, int]) -> tuple[PieceSummary, ...]:
+def _upright(odometry: Odometry, frames: Sequence[FramePose]) -> tuple[list[FramePose], dict[int, Up]]:
+    """`frames` in worlds whose z is up, of pieces whose surfaces tell it, and up of these."""
+    members: dict[int, list[FramePose]] = {}
+    for frame in frames:
+        if frame.keyframe >= 0:
+            members.setdefault(frame.piece, []).append(frame)
+    turns: dict[int, FloatArray] = {}
+    ups: dict[int, Up] = {}
+    for piece, keyframes in members.items():
+        poses = np.stack([frame.world_from_camera for frame in keyframes if frame.world_from_camera is not None])
+        up = find_up([odometry.keyframes.all[frame.keyframe].depth for frame in keyframes], poses)
+        if up is not None:
+            turns[piece] = level_world(poses[0], up.direction)
+            ups[piece] = replace(up, direction=np.array([0.0, 0.0, 1.0]))
+    return [_turned(frame, turns[frame.piece]) if frame.piece in turns else frame for frame in frames], ups
+
+
+def _turned(frame: FramePose, turn: FloatArray) -> FramePose:
+    pose, before, covariance = frame.world_from_camera, frame.before_closing, frame.covariance
+    return replace(
+        frame,
+        world_from_camera=None if pose is None else turn @ pose,
+        before_closing=None if before is None else turn @ before,
+        covariance=None if covariance is None else _rotated(covariance, turn[:3, :3]),
+    )
+
+
+def _pieces(frames: Sequence[FramePose], numbers: Mapping[int, int], ups: Mapping[int, Up]) -> tuple[PieceSummary, ...]:
     found = []
     for number in sorted(numbers.values()):
         members = [frame for frame in frames if frame.piece == number]
         positions = [frame.position for frame in members]
         keyframes = sum(frame.keyframe >= 0 for frame in members)
-        found.append(PieceSummary(number, len(members), keyframes, min(positions), max(positions)))
+        found.append(PieceSummary(number, len(members), keyframes, min(positions), max(positions), ups.get(number)))
     return tuple(found)
 
 

@@ -130,6 +130,7 @@ class TrajectoryOptions:
     motion: MotionPrior = field(default_factory=MotionPrior)
     close_loops: bool = True
     adjust: bool = True
+    upright: bool = True  # turn worlds so that z is up, where surfaces tell it
     threads: int = field(default_factory=cores)
 
     @property

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from semdb.trajectory.edges import Edge, EdgeKind, EdgeState
 from semdb.trajectory.odometry import FrameState
+from semdb.trajectory.upright import Up
 from semdb.types import FloatArray
 
 
@@ -45,21 +46,26 @@ class Drift:
 
 @dataclass(frozen=True, slots=True)
 class PieceSummary:
-    """A stretch that is one trajectory: number (0 is the largest), frames with a pose, keyframes, first and last."""
+    """A stretch that is one trajectory: number (0 is the largest), frames with a pose, keyframes, first and last.
+
+    `up` is what tells gravity in its world: where it is known, z is up, to `up.sigma_deg`.
+    """
 
     number: int
     frames: int
     keyframes: int
     first_position: int
     last_position: int
+    up: Up | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
     """The trajectory of a sequence of frames. Edges name keyframes by number, `keyframes` says which frames they are.
 
-    The world is that of the first keyframe of the largest piece. `readout_s` is the time from the first row of an
-    image to the last, as the images show it (0 where they show none).
+    The world of a piece has its origin at its first keyframe. Where surfaces tell which way is up it is turned so: z
+    up, and x where the first keyframe looks, level; else its axes are those of the first keyframe. `readout_s` is the
+    time from the first row of an image to the last, as the images show it (0 where they show none).
     """
 
     frames: tuple[FramePose, ...]
@@ -73,6 +79,11 @@ class Trajectory:
     def count(self, state: FrameState) -> int:
         """How many frames are in `state`."""
         return sum(frame.state is state for frame in self.frames)
+
+    @property
+    def up(self) -> Up | None:
+        """Up of the largest piece, in its world: z, or None where gravity is not known."""
+        return self.pieces[0].up if self.pieces else None
 
     @property
     def used(self) -> tuple[FramePose, ...]:

@@ -96,7 +96,23 @@ def test_a_rendered_room_is_tracked_to_millimetres(room: Frames) -> None:
     assert 3 <= len(found.keyframes) <= 20
     assert len(found.pieces) == 1
     assert found.pieces[0].frames == 24
-    np.testing.assert_array_equal(found.frames[0].world_from_camera, np.eye(4))
+
+
+def test_the_world_is_upright_from_the_first_keyframe_on(room: Frames) -> None:
+    found, plain = room.find(), room.find(TrajectoryOptions(threads=1, upright=False))
+    first = found.frames[0].world_from_camera
+    assert first is not None
+    assert found.up is not None
+    np.testing.assert_allclose(first[:3, 3], 0.0, atol=1e-12)
+    assert first[1, 2] == pytest.approx(0.0, abs=1e-9)  # it looks along x
+    assert first[0, 2] > 0.9
+    up = (room.true[0] @ np.linalg.inv(first))[:3, :3] @ [0.0, 0.0, 1.0]
+    assert np.degrees(np.arccos(up[2])) < 3 * found.up.sigma_deg < 4
+    np.testing.assert_array_equal(plain.frames[0].world_from_camera, np.eye(4))
+    assert plain.up is None
+    for one, two in zip(found.used, plain.used, strict=True):
+        np.testing.assert_allclose(np.linalg.inv(first) @ one.world_from_camera, two.world_from_camera, atol=1e-9)
+        np.testing.assert_allclose(np.linalg.eigvalsh(one.covariance), np.linalg.eigvalsh(two.covariance), atol=1e-12)
 
 
 def test_covariances_grow_away_from_the_first_keyframe_and_hold_the_error(room: Frames) -> None:
@@ -107,7 +123,7 @@ def test_covariances_grow_away_from_the_first_keyframe_and_hold_the_error(room: 
     assert len(sigmas) == 24
     assert sigmas[0] < 1e-6
     assert 0.0003 < np.median(sigmas[12:]) < 0.03
-    world = room.true[0]
+    world = room.true[0] @ np.linalg.inv(np.asarray(found.frames[0].world_from_camera))
     off = [np.linalg.norm((world @ f.world_from_camera)[:3, 3] - room.true[f.position][:3, 3]) for f in found.used[1:]]
     assert np.median(np.array(off) / sigmas[1:]) < 3
 
