@@ -215,7 +215,7 @@ def _read_plain(
         return None
     quats = numbers[:, 3:] if quaternion == "wxyz" else numbers[:, [6, 3, 4, 5]]
     with np.errstate(over="ignore"):
-        norms = np.sqrt((quats * quats).sum(axis=1, keepdims=True))
+        norms = np.array([np.linalg.norm(quat) for quat in quats])[:, None]  # the same bits as line by line
     if not (np.isfinite(numbers).all() and (np.abs(norms - 1) <= NORM_TOLERANCE).all()):
         return None
     return times, quats / norms, numbers[:, :3]

@@ -12,7 +12,7 @@ import pytest
 from semdb.errors import RecordingError, UsageError
 from semdb.geometry import pose_error, rotation_from_quat_wxyz, slerp_wxyz
 from semdb.recordings import open_recording, open_recordings, parse_camera
-from semdb.recordings.association import nearest_pairs, parse_time_ns, pose_at, read_trajectory
+from semdb.recordings.association import nearest_pairs, parse_pose, parse_time_ns, pose_at, read_trajectory
 from semdb.recordings.cameras import ICL_NUIM, ROS_DEFAULT, SEVEN_SCENES_COLOR, TUM_CAMERAS
 from semdb.types import Camera
 from tests.unit.recording_miniatures import (
@@ -277,3 +277,16 @@ def test_camera_json_errors_name_the_key(tmp_path: Path, change: dict[str, objec
     with pytest.raises(RecordingError, match=message) as caught:
         open_recording(folder)
     assert str(folder / "camera.json") in str(caught.value)
+
+
+def test_plain_files_give_the_same_bits_as_line_by_line(tmp_path: Path) -> None:
+    """Recordings that were planned before are known by the bits of their poses."""
+    rng = np.random.default_rng(3)
+    quats = rng.normal(size=(2000, 4))
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    rows = np.concatenate([rng.normal(size=(2000, 3)), quats], axis=1)
+    texts = [" ".join(f"{value:.4f}" for value in row) for row in rows]
+    (tmp_path / "groundtruth.txt").write_text("\n".join(f"{n}.5 {text}" for n, text in enumerate(texts)))
+    trajectory, notes = read_trajectory(tmp_path / "groundtruth.txt")
+    assert notes == []
+    assert (trajectory.quat_wxyz == np.stack([parse_pose(text.split())[0] for text in texts])).all()
