@@ -15,6 +15,7 @@ from semdb.names import storable
 
 if TYPE_CHECKING:
     from semdb.database.reporting import WorkerStatus
+    from semdb.door.links import KeyframeLink
     from semdb.types import ModelInfo
 
 
@@ -89,6 +90,15 @@ class Reading(Base):
     def check_keyframes(self, ids: Iterable[int]) -> None:
         """Raises NotFoundError, naming it, for a keyframe that is not there; damaged ones are."""
         self._store().check_keyframes([int(key) for key in ids])
+
+    def loops(self, map: str | None = None, *, odometry: bool = False) -> list[KeyframeLink]:
+        """What ties keyframes of a map, or of all, together: closures, and with `odometry` what follows each other.
+
+        By keyframe ids. A damaged row is left out aloud. Raises NotFoundError.
+        """
+        from semdb.api.links import links_of
+
+        return links_of(self._store(), self._map_id(map), odometry=odometry)
 
     def sql(self, statement: str) -> Rows:
         """The rows of one read-only statement, fetched while they are iterated over.

@@ -203,8 +203,8 @@ class Writing(Reading):
     ) -> str:
         """Writes a map as other programs read it, or whole (`semdb`); returns a line about what was written.
 
-        `format` is tum, colmap, kapture, ply, mcap or semdb; `out` a file or folder that is not there. `voxel_m` and
-        `max_depth_m` thin and bound a cloud. Raises UsageError, NotFoundError, DatabaseError.
+        `format` is tum, colmap, kapture, ply, mcap, g2o or semdb; `out` a file or folder that is not there. `voxel_m`
+        and `max_depth_m` thin and bound a cloud. Raises UsageError, NotFoundError, DatabaseError.
         """
         from semdb.exchange.formats import export_map
         from semdb.exchange.source import ExportOptions

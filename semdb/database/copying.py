@@ -21,7 +21,8 @@ from semdb.errors import DatabaseError, UsageError
 
 SHARED = {"models": "digest", "cameras": "digest", "categories": "name"}
 ORDER = ("maps", "recordings", "keyframes", "objects")  # what else hangs from, each from the one before
-NOT_COPIED = ("queries", "keyframe_changes")
+# logs, and what links two keyframes, which goes when both are there
+NOT_COPIED = ("queries", "keyframe_changes", "pose_operations", "pose_revisions", "loop_closures")
 CHUNK = 16  # keyframes that are read at a time
 Progress = Callable[[int, int], None]
 
@@ -51,6 +52,7 @@ def copy_map(source: Engine, map_id: int, target: Engine, name: str, *, progress
     total = _count(source, map_id)
     for row in _rows(source, select(tables.recordings).where(tables.recordings.c.map_id == map_id)):
         _copy_recording(copy, row, name, total, progress)
+    _copy_links(copy, map_id)
     for table in _hanging_from("maps"):
         if table.name not in ("recordings", *NOT_COPIED):
             _copy_rows(copy, table, "map_id", map_id)
@@ -157,7 +159,7 @@ def _copy_recording(copy: _Copy, row: dict[str, Any], name: str, total: int, pro
     copy.ids.setdefault("recordings", {})[old] = new_key
     copy.done.recordings += created
     for table in _hanging_from("recordings"):
-        if table.name != "keyframes":
+        if table.name not in ("keyframes", *NOT_COPIED):
             _copy_rows(copy, table, _reference(table, "recordings"), old)
     for chunk in _keyframe_chunks(copy.source, old):
         _copy_keyframes(copy, chunk)
@@ -196,6 +198,36 @@ def _copy_keyframes(copy: _Copy, rows: Sequence[dict[str, Any]]) -> None:
     }
     for row in rows:
         _copy_keyframe(copy, row, children, of_objects)
+
+
+def _copy_links(copy: _Copy, map_id: int) -> None:
+    """Links between keyframes of the map, those that are there already left as they are."""
+    k, c = tables.keyframes.c, tables.loop_closures.c
+    places = {
+        engine: {
+            (int(row["recording_id"]), int(row["frame_index"])): int(row["id"])
+            for row in _rows(engine, select(k.id, k.recording_id, k.frame_index).join(tables.recordings).where(mine))
+        }
+        for engine, mine in (
+            (copy.source, tables.recordings.c.map_id == map_id),
+            (copy.target, tables.recordings.c.map_id == copy.ids["maps"][map_id]),
+        )
+    }
+    recordings, theirs = copy.ids.get("recordings", {}), places[copy.target]
+    new = {key: theirs.get((recordings[place[0]], place[1])) for place, key in places[copy.source].items()}
+    of_map = select(k.id).join(tables.recordings).where(tables.recordings.c.map_id == map_id)
+    rows = _rows(copy.source, select(tables.loop_closures).where(c.keyframe_id.in_(of_map)))
+
+    def work(connection: Connection) -> None:
+        for row in rows:
+            first, second = new.get(int(row["keyframe_id"])), new.get(int(row["other_keyframe_id"]))
+            same = [c.keyframe_id == first, c.other_keyframe_id == second, c.kind == row["kind"]]
+            if first is None or second is None or connection.execute(select(c.kind).where(*same)).first() is not None:
+                continue
+            ends = {"keyframe_id": first, "other_keyframe_id": second}
+            connection.execute(insert(tables.loop_closures), {**row, **ends})
+
+    retry.write(copy.target, work)
 
 
 def _by_parent(engine: Engine, table: Table, column: str, ids: Sequence[int]) -> dict[int, list[dict[str, Any]]]:

@@ -22,6 +22,8 @@ from semdb.database.tables import (
     keyframes,
     map_models,
     maps,
+    planned_links,
+    planned_poses,
     queries,
     recordings,
 )
@@ -97,7 +99,8 @@ def delete_recording(engine: Engine, recording_id: int, progress: Progress | Non
     deleted = delete_keyframes(engine, keyframe_ids, progress)
     # Each writer changes its row of the plan first and holds it until it commits: this waits for those that have, and
     # refuses the others. Were it left to the foreign key, keyframes that commit meanwhile would go without a trace.
-    _delete_rows(engine, ingest_items.c.recording_id, recording_id, ingest_items.c.frame_index)
+    for table in (ingest_items, planned_poses, planned_links):
+        _delete_rows(engine, table.c.recording_id, recording_id, table.c.frame_index)
     deleted += retry.write(engine, finish)
     _drop_orphans(engine)
     return Deleted(recordings=1, keyframes=deleted)

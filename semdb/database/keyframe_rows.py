@@ -12,15 +12,15 @@ import numpy.typing as npt
 from semdb.database import checked
 from semdb.database.codecs import decode_array, decode_keypoints, keypoint_rows
 from semdb.database.records import KeyframeHead, StoredKeyframe, StoredObject
-from semdb.errors import CodecError
-from semdb.geometry import pose_from, rotation_from_quat_wxyz
+from semdb.database.tables import POSE_COLUMNS
+from semdb.errors import CodecError, UsageError
+from semdb.geometry import FARTHEST_POSE_M, pose_from, quat_wxyz_from_rotation, rotation_from_quat_wxyz
 from semdb.types import Camera, Float32Array, FloatArray, IntArray, ObjectGeometry
 
 MOST_OBJECTS = 10_000
 FARTHEST_POINT_M = 1e6  # of a 3D point from its camera
 OUTSIDE = 2.0  # pixels that a keypoint may lie outside of the image
 WIDEST = 4096  # numbers of a descriptor
-POSE = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
 
 
 @dataclass(slots=True)
@@ -76,14 +76,24 @@ def head_of(row: Any) -> KeyframeHead:
         frame_index=checked.integer(row.frame_index, f"keyframes.frame_index of {where}"),
         timestamp_ns=None if time is None else checked.integer(time, f"keyframes.timestamp_ns of {where}", *limits),
         camera=checked.camera(row, f"camera {row.camera_id} ({where})"),
-        world_from_camera=pose_of([getattr(row, name) for name in POSE], where),
+        world_from_camera=pose_of([getattr(row, name) for name in POSE_COLUMNS], where),
     )
 
 
 def pose_of(values: Sequence[Any], where: str) -> FloatArray:
-    """The pose ``[4, 4]`` of the columns `POSE`. Raises CodecError."""
+    """The pose ``[4, 4]`` of the columns `POSE_COLUMNS`. Raises CodecError."""
     numbers = checked.pose_numbers(values, where)
     return pose_from(rotation_from_quat_wxyz(numbers[:4]), numbers[4:])
+
+
+def pose_columns(world_from_camera: FloatArray) -> dict[str, float]:
+    """The columns qw, qx, qy, qz, tx, ty, tz of a pose ``[4, 4]``. Raises UsageError for what is none."""
+    if world_from_camera.shape != (4, 4) or not np.isfinite(world_from_camera).all():
+        raise UsageError("a keyframe needs a finite 4x4 pose")
+    if np.abs(world_from_camera[:3, 3]).max() > FARTHEST_POSE_M:
+        raise UsageError(f"a keyframe is at most {FARTHEST_POSE_M:g} m from the origin of its map")
+    numbers = [*quat_wxyz_from_rotation(world_from_camera[:3, :3]), *world_from_camera[:3, 3]]
+    return dict(zip(POSE_COLUMNS, map(float, numbers), strict=True))
 
 
 def _check_keypoints(packed: Float32Array, row: Any, camera: Camera, where: str) -> None:

@@ -11,6 +11,9 @@ from sqlalchemy.exc import IntegrityError
 
 from semdb.database import checked, retry
 from semdb.database.ids import SharedIds, check_name, new_id
+from semdb.database.links import write_planned_links
+from semdb.database.pose_records import PoseSource
+from semdb.database.pose_sources import insert_poses, poses_of
 from semdb.database.records import (
     FailedItem,
     ItemState,
@@ -196,6 +199,9 @@ def _check_plan(plan: RecordingPlan, infos: Sequence[ModelInfo]) -> None:
         raise UsageError("the fingerprint of a recording has 1 to 64 characters")
     if len(set(plan.frame_indexes)) != len(plan.frame_indexes):
         raise UsageError(f"the plan of the recording {plan.name!r} names a frame twice")
+    missing = [] if plan.poses is None else sorted(set(plan.frame_indexes) - set(plan.poses.poses))
+    if missing:
+        raise UsageError(f"the plan of the recording {plan.name!r} has no pose of frame {missing[0]}")
     if tuple(sorted(info.role for info in infos)) != ROLES:
         raise UsageError(f"a recording is described by one model of each role {ROLES}")
 
@@ -215,6 +221,7 @@ def _insert_plan(connection: Connection, map_id: int, plan: RecordingPlan) -> Pl
     if indexes:
         item = {"recording_id": recording_id, "state": ItemState.PENDING.value, "attempts": 0}
         connection.execute(insert(ingest_items), [{**item, "frame_index": index} for index in indexes])
+    insert_poses(connection, recording_id, map_id, plan.poses)
     return PlannedRecording(recording_id, map_id, indexes, (), ())
 
 
@@ -223,6 +230,9 @@ def _resume(connection: Connection, row: Row[Any], plan: RecordingPlan, map_name
     name = f"the recording {plan.name!r} of the map {map_name!r}"
     if row.state == RecordingState.DELETING:
         raise UsageError(f"{name} is being deleted: let `semdb delete` finish")
+    known = poses_of(connection, row.id).source
+    if (known is PoseSource.ESTIMATED) != (plan.poses is not None):
+        raise UsageError(f"{name} is stored already with {known} poses: ask for these (--poses {known}), or {advice}")
     # It may have grown: the same keyframes are still those that were planned.
     for what, old, new, same in (
         ("format", row.format, plan.format, row.format == plan.format),
@@ -336,7 +346,10 @@ def finish_recording(engine: Engine, recording_id: int) -> RecordingState:
             ingest_items.c.recording_id == recording_id,
             ingest_items.c.state.in_([ItemState.PENDING.value, ItemState.RUNNING.value]),
         )
-        if connection.execute(left).scalar() or state in (RecordingState.COMPLETE, RecordingState.DELETING):
+        open_ones = connection.execute(left).scalar()
+        if not open_ones and state != RecordingState.DELETING:
+            write_planned_links(connection, recording_id)
+        if open_ones or state in (RecordingState.COMPLETE, RecordingState.DELETING):
             return checked.choice(state, f"recordings.state of recording {recording_id}", RecordingState)
         values = {"state": RecordingState.COMPLETE.value, "finished_at": func.current_timestamp()}
         connection.execute(update(recordings).where(recordings.c.id == recording_id).values(values))

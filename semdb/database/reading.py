@@ -11,9 +11,10 @@ from sqlalchemy import Connection, Engine, Select, select
 
 from semdb.database import checked, retry
 from semdb.database.codecs import decode_mask, decode_vectors
-from semdb.database.keyframe_rows import POSE, KeyframeRows, head_of, keyframe_of
+from semdb.database.keyframe_rows import KeyframeRows, head_of, keyframe_of
 from semdb.database.records import KeyframeHead, StoredImage, StoredKeyframe
 from semdb.database.tables import (
+    POSE_COLUMNS,
     cameras,
     categories,
     cnn_vectors,
@@ -97,7 +98,7 @@ def poses(
     CodecError.
     """
     k = keyframes.c
-    query = select(k.id, *(k[name] for name in POSE)).join(recordings).where(recordings.c.map_id == map_id)
+    query = select(k.id, *(k[name] for name in POSE_COLUMNS)).join(recordings).where(recordings.c.map_id == map_id)
 
     def work(connection: Connection) -> list[Any]:
         if keys is None:
@@ -105,7 +106,7 @@ def poses(
         return list(_chunked(connection, _ints(keys), lambda chunk: query.where(k.id.in_(chunk))))
 
     rows = sorted(map(tuple, retry.read(engine, work)), key=lambda row: row[0])
-    numbers = checked.numbers_of([row[1:] for row in rows], len(POSE))
+    numbers = checked.numbers_of([row[1:] for row in rows], len(POSE_COLUMNS))
     usable = checked.are_poses(numbers)
     for place in np.flatnonzero(~usable):
         try:

@@ -8,6 +8,7 @@ from datetime import datetime
 from enum import StrEnum
 from typing import Any
 
+from semdb.database.pose_records import PlannedPoses
 from semdb.types import Camera, Description, Float32Array, FloatArray, Keypoints, ModelInfo, ObjectGeometry
 
 
@@ -30,6 +31,7 @@ class ChangeKind(StrEnum):
     ADDED = "added"
     DELETED = "deleted"
     REDESCRIBED = "redescribed"
+    MOVED = "moved"  # its pose is another, or it came from another map or went to one
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +71,7 @@ class RecordingPlan:
     fingerprint: str
     frame_indexes: tuple[int, ...]  # of the keyframes
     extends: str = ""
+    poses: PlannedPoses | None = None  # estimated ones; None: the recording brings its own
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,11 +16,20 @@ from sqlalchemy.sql.elements import ColumnElement
 
 from semdb.database import checked, retry
 from semdb.database.exact_sums import exact_sum, whole
-from semdb.database.keyframe_rows import FARTHEST_POINT_M, POSE, pose_of
+from semdb.database.keyframe_rows import FARTHEST_POINT_M, pose_of
 from semdb.database.point_rows import listed_keyframes
 from semdb.database.reading import Bad
 from semdb.database.records import ClassConfusion, MapObject, Refinement
-from semdb.database.tables import categories, class_confusions, keyframes, maps, objects, recordings, refinements
+from semdb.database.tables import (
+    POSE_COLUMNS,
+    categories,
+    class_confusions,
+    keyframes,
+    maps,
+    objects,
+    recordings,
+    refinements,
+)
 from semdb.errors import CodecError, NotFoundError
 from semdb.geometry import FARTHEST_POSE_M
 
@@ -190,7 +199,7 @@ def _map_object(keyframe: int, row: Any) -> MapObject:
         keyframe=keyframe,
         category=checked.text(row.name, f"categories.name {where}"),
         score=checked.real(row.score, f"objects.score {where}", 0.0, 1.0),
-        world_from_camera=pose_of([getattr(row, name) for name in POSE], f"keyframe {row.keyframe_id}"),
+        world_from_camera=pose_of([getattr(row, name) for name in POSE_COLUMNS], f"keyframe {row.keyframe_id}"),
         centroid=place("centroid"),
         extent=place("extent"),
     )

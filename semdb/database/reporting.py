@@ -12,6 +12,7 @@ from sqlalchemy.sql.elements import ColumnElement
 from semdb.database import checked, retry
 from semdb.database.clock import now_plus
 from semdb.database.ids import new_id
+from semdb.database.keyframe_rows import pose_columns
 from semdb.database.records import ItemState, RecordingState, RecordingStatus
 from semdb.database.tables import (
     ingest_items,
@@ -23,7 +24,6 @@ from semdb.database.tables import (
     queries,
     recordings,
 )
-from semdb.database.writing import pose_columns
 from semdb.types import Localization
 
 

@@ -63,11 +63,20 @@ class CoarseRows:
     words: tuple[tuple[int, str, int], ...]  # keyframe, word (`semdb.class_score.word`), number, none of them 0
 
 
-def coarse_rows(engine: Engine, ids: Int64Array, size: int | None = None, bad: Bad | None = None) -> CoarseRows:
-    """What is there of these keyframes, as of one moment; `size` and `bad` as in `vectors_there`."""
-    wanted = np.unique(ids)
+def coarse_rows(
+    engine: Engine, map_id: int, ids: Int64Array, size: int | None = None, bad: Bad | None = None
+) -> CoarseRows:
+    """What is there of these keyframes in the map, as of one moment; `size` and `bad` as in `vectors_there`.
+
+    One that was moved into another map is not there.
+    """
 
     def work(connection: Connection) -> tuple[list[tuple[int, bytes]], list[tuple[int, str, int]]]:
+        k = keyframes.c
+        mine = select(k.id).join(recordings, recordings.c.id == k.recording_id).where(recordings.c.map_id == map_id)
+        asked = np.unique(ids).tolist()
+        here = [key for keys in _in_chunks(asked) for key in connection.execute(mine.where(k.id.in_(keys))).scalars()]
+        wanted = np.array(sorted(here), np.int64)
         c = keyframe_categories.c
         values = (c.count, c.upper_strength, c.lower_strength)
         query = select(c.keyframe_id, categories.c.name, *values).join(categories, categories.c.id == c.category_id)

@@ -291,10 +291,10 @@ class Store:
         return change_log.change_text(self.engine, map_id, change_id)
 
     def coarse_rows(
-        self, keyframe_ids: Int64Array, size: int | None = None, bad: Bad | None = None
+        self, map_id: int, keyframe_ids: Int64Array, size: int | None = None, bad: Bad | None = None
     ) -> scanning.CoarseRows:
-        """Vectors and class counts of those keyframes that are there, as of one moment: see `scanning.coarse_rows`."""
-        return scanning.coarse_rows(self.engine, keyframe_ids, size, bad)
+        """Vectors and class counts of those keyframes that the map has, at one moment: see `scanning.coarse_rows`."""
+        return scanning.coarse_rows(self.engine, map_id, keyframe_ids, size, bad)
 
     def say_class_rows_that_are_none(self, map_id: int) -> None:
         """Says which keyframes of a map have objects per class that are no numbers, and count as none."""

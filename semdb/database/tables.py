@@ -92,6 +92,7 @@ class Words(Name):
 
 
 LongText = Text().with_variant(LONGTEXT(), "mysql", "mariadb")
+POSE_COLUMNS = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
 STRENGTH_COLUMNS = ("upper_strength", "lower_strength", "keyframe_strength")
 
 
@@ -112,13 +113,29 @@ def _id() -> Column[int]:
     return Column("id", Id, primary_key=True, autoincrement=True)
 
 
-def _ref(name: str, target: str, *, cascade: bool = True, **options: Any) -> Column[int]:
+def _ref(name: str, target: str, *, cascade: bool = True, nullable: bool = False, **options: Any) -> Column[int]:
     foreign_key = ForeignKey(target, ondelete="CASCADE" if cascade else None)
-    return Column(name, Id, foreign_key, nullable=False, autoincrement=False, **options)
+    return Column(name, Id, foreign_key, nullable=nullable, autoincrement=False, **options)
 
 
 def _time(name: str) -> Column[Any]:
     return Column(name, _Moment, nullable=False, server_default=func.current_timestamp())
+
+
+def _pose(prefix: str = "") -> list[Column[Any]]:
+    return [Column(f"{prefix}{name}", Double, nullable=False) for name in POSE_COLUMNS]
+
+
+def _link() -> list[Column[Any]]:
+    """The pose of another keyframe in the frame of one, and why it is believed."""
+    return [
+        *_pose(),
+        Column("information", Blob, nullable=False),
+        Column("inliers", Integer, nullable=False),
+        Column("state", String(16), nullable=False),
+        Column("reason", Words, nullable=False),
+        Column("provenance", String(NAME_LENGTH), nullable=False),
+    ]
 
 
 maps = _table("maps", _id(), Column("name", Name(NAME_LENGTH), nullable=False, unique=True), _time("created_at"))
@@ -186,7 +203,7 @@ keyframes = _table(
     Column("frame_index", Integer, nullable=False),
     Column("timestamp_ns", BigInteger),
     _ref("camera_id", "cameras.id", cascade=False, index=True),
-    *(Column(name, Double, nullable=False) for name in ("qw", "qx", "qy", "qz", "tx", "ty", "tz")),
+    *_pose(),
     UniqueConstraint("recording_id", "frame_index"),
 )
 
@@ -293,7 +310,7 @@ queries = _table(
     _time("created_at"),
     Column("image", Words, nullable=False),
     Column("verdict", String(16), nullable=False),
-    *(Column(name, Double) for name in ("qw", "qx", "qy", "qz", "tx", "ty", "tz")),
+    *(Column(name, Double) for name in POSE_COLUMNS),
     Column("confidence", Double, nullable=False),
     Column("inliers", Integer, nullable=False),
     Column("stage", String(16), nullable=False),
@@ -329,4 +346,67 @@ refined_points = _table(
     Column("fused", Integer, nullable=False),
     Column("triangulated", Integer, nullable=False),
     Column("data", Blob, nullable=False),
+)
+
+pose_sources = _table(
+    "pose_sources",
+    _ref("recording_id", "recordings.id", primary_key=True),
+    Column("pose_source", String(16), nullable=False),
+    Column("world", String(32), nullable=False),
+    Column("upright", Integer),
+    *_pose(),
+)
+
+planned_poses = _table(
+    "planned_poses",
+    _ref("recording_id", "recordings.id", primary_key=True),
+    Column("frame_index", Integer, primary_key=True, autoincrement=False),
+    *_pose(),
+    Column("covariance", Blob),
+)
+
+planned_links = _table(
+    "planned_links",
+    _ref("recording_id", "recordings.id", primary_key=True),
+    Column("frame_index", Integer, primary_key=True, autoincrement=False),
+    Column("other_frame_index", Integer, primary_key=True, autoincrement=False),
+    Column("kind", String(16), primary_key=True),
+    *_link(),
+)
+
+pose_covariances = _table(
+    "pose_covariances",
+    _ref("keyframe_id", "keyframes.id", primary_key=True),
+    Column("data", Blob, nullable=False),
+)
+
+loop_closures = _table(
+    "loop_closures",
+    _ref("keyframe_id", "keyframes.id", primary_key=True),
+    _ref("other_keyframe_id", "keyframes.id", primary_key=True, index=True),
+    Column("kind", String(16), primary_key=True),
+    *_link(),
+)
+
+pose_operations = _table(
+    "pose_operations",
+    _id(),
+    Column("kind", String(16), nullable=False),
+    _ref("map_id", "maps.id", index=True),
+    _ref("recording_id", "recordings.id", nullable=True, index=True),
+    Column("from_map_id", BigInteger),
+    Column("from_map", Name(NAME_LENGTH)),
+    Column("from_name", Name(NAME_LENGTH)),
+    Column("parameters", LongText, nullable=False),
+    _time("created_at"),
+    Column("undone_at", _Moment),
+)
+
+pose_revisions = _table(
+    "pose_revisions",
+    _ref("keyframe_id", "keyframes.id", primary_key=True),
+    _ref("operation_id", "pose_operations.id", primary_key=True, index=True),
+    *_pose("before_"),
+    *_pose("after_"),
+    _time("changed_at"),
 )

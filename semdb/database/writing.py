@@ -17,11 +17,12 @@ from semdb.database.codecs import encode_array, encode_keypoints, encode_mask, i
 from semdb.database.engine import check_packet
 from semdb.database.ids import SharedIds, new_id
 from semdb.database.items import Claim, held_by
+from semdb.database.keyframe_rows import pose_columns
 from semdb.database.planning import check_models, map_model_ids
+from semdb.database.pose_sources import place_of
 from semdb.database.records import ChangeKind, ItemState, KeyframeRecord, RecordingState, WriteResult
 from semdb.errors import LeaseLostError, NotFoundError, UnstorableError, UsageError
-from semdb.geometry import FARTHEST_POSE_M, quat_wxyz_from_rotation
-from semdb.types import Description, FloatArray, ModelInfo
+from semdb.types import Description, ModelInfo
 
 _STATEMENT_OVERHEAD = 4096  # bytes of a statement beside its blobs
 _item = tables.ingest_items.c
@@ -36,6 +37,10 @@ _TAKE = _MARK_DONE.values(attempts=_item.attempts + 1).where(
 _OBJECT_IDS = select(tables.objects.c.ordinal, tables.objects.c.id).where(
     tables.objects.c.keyframe_id == bindparam("of_keyframe")
 )
+
+
+class _MovedError(Exception):
+    """The recording is in another map than it was when its keyframe was made ready."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,12 +96,15 @@ class KeyframeWriter:
             try:
                 work = partial(_write, target=target, recording_id=recording_id, rows=rows, claimed=claimed)
                 return retry.write(self._engine, work)
+            except _MovedError:
+                self.forget()  # the recording is in another map by now
             except IntegrityError as error:
                 # Another writer stored the same keyframe, or a row that was remembered has been deleted.
                 failure = error
                 self.forget()
         raise UnstorableError(
-            f"frame {record.frame_index} of the recording {recording_id} could not be stored ({failure})"
+            f"frame {record.frame_index} of the recording {recording_id} could not be stored "
+            f"({failure or 'the recording moved from map to map'})"
         ) from failure
 
     def _target(self, recording_id: int) -> _Target:
@@ -160,16 +168,6 @@ class KeyframeWriter:
             },
             descriptors={**features, "data": encode_array(_packed(description, record.descriptor_dtype))},
         )
-
-
-def pose_columns(world_from_camera: FloatArray) -> dict[str, float]:
-    """The columns qw, qx, qy, qz, tx, ty, tz of a pose ``[4, 4]``. Raises UsageError for what is none."""
-    if world_from_camera.shape != (4, 4) or not np.isfinite(world_from_camera).all():
-        raise UsageError("a keyframe needs a finite 4x4 pose")
-    if np.abs(world_from_camera[:3, 3]).max() > FARTHEST_POSE_M:
-        raise UsageError(f"a keyframe is at most {FARTHEST_POSE_M:g} m from the origin of its map")
-    numbers = [*quat_wxyz_from_rotation(world_from_camera[:3, :3]), *world_from_camera[:3, 3]]
-    return dict(zip(("qw", "qx", "qy", "qz", "tx", "ty", "tz"), map(float, numbers), strict=True))
 
 
 def _sort_key(object_index: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
@@ -267,8 +265,14 @@ def _write(
             mine = claimed is not None and connection.execute(own).scalar() == claimed.token
             return WriteResult(int(keyframe_id), created=mine)
         _refuse(connection, recording_id, frame_index)
-    keyframe_id = new_id(connection, tables.keyframes, {**rows.keyframe, "recording_id": recording_id})
+    place = place_of(connection, recording_id, frame_index)
+    if place.map_id != target.map_id:
+        raise _MovedError
+    keyframe = {**rows.keyframe, "recording_id": recording_id, **place.moved(rows.keyframe)}
+    keyframe_id = new_id(connection, tables.keyframes, keyframe)
     _write_children(connection, keyframe_id, rows)
+    if (covariance := place.covariance(frame_index)) is not None:
+        connection.execute(insert(tables.pose_covariances), {"keyframe_id": keyframe_id, "data": covariance})
     change = {"map_id": target.map_id, "keyframe_id": keyframe_id, "kind": ChangeKind.ADDED.value}
     connection.execute(insert(tables.keyframe_changes), change)
     return WriteResult(keyframe_id, created=True)

@@ -101,7 +101,7 @@ class MapChange:
     """What changed in a map between two looks at it. An empty one is false."""
 
     added: frozenset[int] = frozenset()  # keyframes that were not there
-    gone: frozenset[int] = frozenset()  # deleted or described anew: what is kept of them is out of date
+    gone: frozenset[int] = frozenset()  # deleted, described anew or moved: what is kept of them is out of date
     everything: bool = False  # not known what: nothing that is kept can be relied on
 
     def __bool__(self) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.config import Config
@@ -15,6 +16,9 @@ from sqlalchemy import Engine, inspect, text
 import semdb.migrations
 from semdb.database import schema
 from semdb.database.engine import make_engine
+from semdb.database.links import list_links
+from semdb.database.pose_records import PoseSource, World
+from semdb.database.pose_sources import recording_poses
 from semdb.database.records import ChangeKind
 from semdb.database.store import Store, open_store
 from semdb.database.tables import metadata
@@ -22,7 +26,14 @@ from semdb.errors import SchemaError
 from tests.database_samples import description, fill
 from tests.integration.comparison import FRAMES, assert_same
 
-VIEWS = {"keyframe_objects", "category_counts", "recording_summary", "covisible_objects", "keypoint_counts"}
+VIEWS = {
+    "keyframe_objects",
+    "category_counts",
+    "recording_summary",
+    "covisible_objects",
+    "keypoint_counts",
+    "keyframe_links",
+}
 
 
 @pytest.fixture
@@ -74,6 +85,23 @@ def test_a_database_with_data_is_upgraded(engine: Engine, empty_url: str) -> Non
             assert_same(keyframe, description(index), index)
         changes = store.changes_since(map_id, 0)
         assert [(change.keyframe_id, change.kind) for change in changes] == [(key, ChangeKind.ADDED) for key in ids]
+        assert len(fill(store, name="second visit")[2]) == len(FRAMES)
+
+
+def test_recordings_of_before_have_recorded_poses(engine: Engine, empty_url: str) -> None:
+    schema.upgrade(engine)
+    with open_store(empty_url) as store:
+        _, recording_id, ids = fill(store)
+    schema.downgrade(engine, "0007")
+    assert "pose_sources" not in inspect(engine).get_table_names()
+    schema.upgrade(engine)
+    with open_store(empty_url) as store:
+        for keyframe, index in zip(store.load_keyframes(ids), FRAMES, strict=True):
+            assert_same(keyframe, description(index), index)
+        known = recording_poses(engine, recording_id)
+        assert (known.source, known.world, known.upright) == (PoseSource.RECORDED, World.RECORDING, None)
+        np.testing.assert_array_equal(known.map_from_recording, np.eye(4))
+        assert list_links(engine) == []
         assert len(fill(store, name="second visit")[2]) == len(FRAMES)
 
 

@@ -61,7 +61,7 @@ def test_lines_are_split_as_a_shell_does(line: str, expected: Line) -> None:
     ("line", "expected"),
     [
         ("semdb ", list(COMMANDS)),
-        ("semdb lo", ["localize"]),
+        ("semdb lo", ["loops", "localize"]),
         ("semdb delete ", ["recording", "map", "keyframes"]),
         ("semdb --in", ["--install-completion"]),
         ("semdb localize --map ", ["hall 2", "room"]),

@@ -74,7 +74,7 @@ def same_as_database(store: Store, map_id: int, mirror: Mirror, state: State) ->
     if not len(living):
         return True
     sample = living[np.unique(np.linspace(0, len(living) - 1, COMPARED).astype(int))]
-    rows = store.coarse_rows(sample, state.vectors.size, store.left_out)
+    rows = store.coarse_rows(map_id, sample, state.vectors.size, store.left_out)
     if len(rows.ids) != len(np.unique(sample)) or rows.vectors.shape[1] != state.vectors.size:
         return False
     places, _ = state.find(rows.ids)

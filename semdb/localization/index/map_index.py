@@ -161,11 +161,11 @@ class MapIndex:
     def _rows(self, wanted: Int64Array, size: int) -> CoarseRows:
         """What is there of keyframes; vectors have `size` numbers where none says otherwise by being whole."""
         try:
-            return self.store.coarse_rows(wanted, bad=self.store.left_out)
+            return self.store.coarse_rows(self.map_id, wanted, bad=self.store.left_out)
         except CodecError:
             if not size:
                 raise
-            return self.store.coarse_rows(wanted, size, self.store.left_out)
+            return self.store.coarse_rows(self.map_id, wanted, size, self.store.left_out)
 
     def _agrees(self) -> bool:
         """Whether the mirror is as the database is; what is written while they are compared is taken in first."""
