@@ -82,6 +82,21 @@ def consistent(closures: Sequence[Edge], chain: Chain, options: ConsistencyOptio
     return found
 
 
+def largest_agreeing(
+    closures: Sequence[Edge], chain: Chain, options: ConsistencyOptions | None = None
+) -> tuple[list[int], BoolArray]:
+    """Positions, ascending, of those of `closures` between two pieces that all agree, and which pairs do ``[m, m]``.
+
+    Whether they are the majority is not asked.
+    """
+    options = options or ConsistencyOptions()
+    if not closures:
+        return [], np.zeros((0, 0), np.bool_)
+    agree = _agreement(*_drifts(closures, chain, options), chain, options)
+    strength = np.array([edge.inliers for edge in closures], float)
+    return _largest_set(agree, np.ones(len(closures), np.bool_), strength), agree
+
+
 def _judge(closures: Sequence[Edge], chain: Chain, options: ConsistencyOptions, *, joined: bool) -> list[Edge]:
     """The closures of one piece (`joined`) or between two, judged."""
     first, second, drift, noise = _drifts(closures, chain, options)
