@@ -15,6 +15,10 @@ import shlex
 import unicodedata
 from collections.abc import Iterable
 from decimal import Decimal
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:  # commands that show no camera do without arrays
+    from semdb.types import Camera
 
 DIGITS = 15  # that every float of eight bytes holds
 _MARKDOWN = re.compile(r"[\\`*\[\]<>|~$&]|(?<![^\W_])_|_(?![^\W_])")
@@ -98,6 +102,12 @@ def number(value: float | Decimal) -> str:
         return str(int(value))  # "-0" is 0 for people
     text = f"{value:.{DIGITS}g}"
     return repr(value) if math.isinf(float(text)) and math.isfinite(value) else text  # the largest, rounded up
+
+
+def camera_numbers(camera: Camera) -> str:
+    """Intrinsics, and coefficients of the lens where there are any, as ``--camera`` takes them."""
+    numbers = (camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion)
+    return ",".join(number(value) for value in numbers)
 
 
 def measure(value: float, decimals: int, *, unless: tuple[float, ...] = (0.0,)) -> str:

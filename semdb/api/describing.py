@@ -74,6 +74,7 @@ class Describing(Localizing):
             camera=None if camera is None else as_camera(camera),
             like=None if like is None else self._like(maps, str(like)),
             known=lambda: self._here.maps().cameras(maps) if maps else [],
+            used=lambda: self._here.maps().used_cameras(maps) if maps else [],
             depth_scale=depth_scale,
             on_disk=self._here.on_disk(),
             say=self._say,

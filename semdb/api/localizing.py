@@ -225,6 +225,7 @@ class Localizing(Base):
             camera=None if camera is None else as_camera(camera),
             like=None if like is None else self._like(maps, str(like)),
             known=lambda: open_maps.cameras(maps),
+            used=lambda: open_maps.used_cameras(maps),
             depth_scale=depth_scale,
             on_disk=self._here.on_disk(),
             paths=paths,

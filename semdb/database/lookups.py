@@ -11,7 +11,7 @@ from sqlalchemy.sql.elements import ColumnElement
 from semdb.database import checked, retry
 from semdb.database.planning import ROLES, model_of
 from semdb.database.reading import depth_scale_of
-from semdb.database.records import MapHead
+from semdb.database.records import MapHead, UsedCamera
 from semdb.database.tables import (
     cameras,
     categories,
@@ -97,6 +97,26 @@ def map_cameras(engine: Engine, map_id: int, say: Callable[[str], None] | None =
             if say is None:
                 raise
             say(f"a camera is left out: {error}")
+    return found
+
+
+def used_cameras(engine: Engine, map_id: int) -> list[UsedCamera]:
+    """The cameras of a map's recordings, each with every recording that it took. One that is none is left out."""
+    used = select(keyframes.c.recording_id, keyframes.c.camera_id).distinct().subquery()
+    query = (
+        select(maps.c.name.label("map_name"), recordings.c.name.label("recording_name"), *_camera_columns())
+        .join(recordings, recordings.c.map_id == maps.c.id)
+        .join(used, used.c.recording_id == recordings.c.id)
+        .join(cameras, cameras.c.id == used.c.camera_id)
+        .where(maps.c.id == map_id)
+        .order_by(recordings.c.id, cameras.c.id)
+    )
+    found = []
+    for row in retry.read(engine, lambda c: list(c.execute(query))):
+        try:
+            found.append(UsedCamera(row.map_name, row.recording_name, checked.camera(row, f"camera {row.id}")))
+        except CodecError:
+            continue
     return found
 
 

@@ -199,6 +199,15 @@ class StoredImage:
 
 
 @dataclass(frozen=True, slots=True)
+class UsedCamera:
+    """A camera, and a recording whose keyframes it took."""
+
+    map: str
+    recording: str
+    camera: Camera
+
+
+@dataclass(frozen=True, slots=True)
 class Change:
     id: int
     keyframe_id: int

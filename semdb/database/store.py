@@ -48,6 +48,7 @@ from semdb.database.records import (
     ScoredKeyframe,
     StoredImage,
     StoredKeyframe,
+    UsedCamera,
     WriteResult,
 )
 from semdb.database.sqlite_file import how_it_is_read
@@ -329,6 +330,10 @@ class Store:
     def cameras(self, map_id: int) -> list[Camera]:
         """The different cameras of a map's keyframes; what is none is said, and left out, where somebody listens."""
         return lookups.map_cameras(self.engine, map_id, self.say)
+
+    def used_cameras(self, map_id: int) -> list[UsedCamera]:
+        """The cameras of a map's recordings, each with every recording that it took. One that is none is left out."""
+        return lookups.used_cameras(self.engine, map_id)
 
     def recording_camera(self, recording_id: int) -> tuple[Camera, float | None]:
         """Camera and depth scale of a recording. Raises NotFoundError without keyframes."""

@@ -15,7 +15,7 @@ from semdb.database.store import Store
 from semdb.errors import NotFoundError, UsageError
 from semdb.ingestion.keyframes import select_keyframes
 from semdb.recordings.base import FrameEntry, Recording
-from semdb.shown import number
+from semdb.shown import camera_numbers, number
 from semdb.types import Camera
 
 ADVICE = "run `semdb delete` for it first, or give the new one another name (--name)"
@@ -143,5 +143,4 @@ def _same_camera(one: Camera, other: Camera) -> bool:
 
 
 def _camera_text(camera: Camera) -> str:
-    numbers = (camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion)
-    return f"{camera.width}x{camera.height} {','.join(number(value) for value in numbers)}"
+    return f"{camera.width}x{camera.height} {camera_numbers(camera)}"

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from semdb.database.planning import check_models
-from semdb.database.records import MapHead
+from semdb.database.records import MapHead, UsedCamera
 from semdb.database.store import Store
 from semdb.errors import CodecError, ModelError, NotFoundError, ProvenanceError, UsageError
 from semdb.localization.coarse import CoarseSource
@@ -96,6 +96,10 @@ class OpenMaps:
     def cameras(self, maps: Sequence[OpenMap]) -> list[Camera]:
         """The cameras of the keyframes of `maps`."""
         return [camera for entry in maps for camera in self._store.cameras(entry.head.id)]
+
+    def used_cameras(self, maps: Sequence[OpenMap]) -> list[UsedCamera]:
+        """The cameras of the recordings of `maps`, with the names of both."""
+        return [used for entry in maps for used in self._store.used_cameras(entry.head.id)]
 
     def close(self) -> None:
         """Writes what indexes have not on disk yet, for the next start; nothing is open then."""

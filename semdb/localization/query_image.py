@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from semdb.database.records import UsedCamera
 from semdb.errors import FrameError, UsageError
 from semdb.localization.on_disk import LikeCamera, RecordingsOnDisk
 from semdb.localization.query_scale import (
@@ -29,12 +30,25 @@ from semdb.recordings.cameras import with_size
 from semdb.recordings.images import header_of, orientation_of, read_bytes, remark_on_color, remark_on_depth
 from semdb.recordings.intrinsics import camera_doubts, camera_problem, depth_scale_problem
 from semdb.recordings.memory import check_frame
+from semdb.shown import camera_numbers
 from semdb.types import Camera, Float32Array, FloatArray, Frame, ImageArray, InstanceMasks
 
 Say = Callable[[str], None]
 PathText = str | PathLike[str]
 Image = PathText | bytes | npt.NDArray[Any] | Frame  # bytes are those of a file
 Depth = PathText | bytes | npt.NDArray[Any]
+
+
+@dataclass(frozen=True, slots=True)
+class _WayOut:
+    """How whoever asks says what is not known."""
+
+    camera: str
+    map: str
+
+
+_IN_MEMORY = _WayOut("camera=(fx, fy, cx, cy), or like=RECORDING", "map=")
+_IN_FILES = _WayOut("--camera fx,fy,cx,cy[,k1,k2,p1,p2,k3], or --like RECORDING", "--map")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,10 +74,10 @@ class QueryReader:
 
     The camera is, in this order, `camera` (from ``--camera``), that of a frame, that of `like` (from ``--like``), that
     of the recording on disk that the image belongs to, `known` when all the map's keyframes have one camera of that
-    size. Depth has `depth_scale` units per metre, or those of `like`, or of the recording; floats in memory are metres.
-    An image that is larger than the map's, and finer, comes at their scale (see `query_scale`). `paths` are the files
-    that will be read, where they are known before. With `nominal` an image without depth whose camera is not known gets
-    that of a usual lens, for where nothing is measured.
+    size; `used` says whose these are where there are several. Depth has `depth_scale` units per metre, or those of
+    `like`, or of the recording; floats in memory are metres. An image that is larger than the map's, and finer, comes
+    at their scale (see `query_scale`). `paths` are the files that will be read, where they are known before. With
+    `nominal` an image without depth whose camera is not known gets that of a usual lens, for where nothing is measured.
     """
 
     def __init__(
@@ -72,6 +86,7 @@ class QueryReader:
         camera: Camera | None = None,
         like: LikeCamera | None = None,
         known: Callable[[], Sequence[Camera]] = tuple,
+        used: Callable[[], Sequence[UsedCamera]] = tuple,
         depth_scale: float | None = None,
         on_disk: RecordingsOnDisk | None = None,
         paths: Collection[Path] = (),
@@ -82,6 +97,7 @@ class QueryReader:
         self._camera = camera
         self._like = like
         self._known = known
+        self._used = used
         self._cameras: Sequence[Camera] | None = None  # those, once asked for
         self._paths = paths
         self._depth_scale = check_depth_scale(depth_scale)
@@ -103,23 +119,21 @@ class QueryReader:
         if isinstance(image, str | PathLike):
             return self._of_file(Path(image), depth)
         name = name or ("image" if number is None else f"image {number}")
-        way_out = "camera=(fx, fy, cx, cy), or like=RECORDING"
         if isinstance(image, bytes):
-            return self._of_bytes(image, name, depth, None, way_out)
+            return self._of_bytes(image, name, depth, None, _IN_MEMORY)
         pixels = as_image(image, name)
         size = (pixels.shape[1], pixels.shape[0])
-        camera, scale = self._camera_of(name, size, None, way_out)
+        camera, scale = self._camera_of(name, size, None, _IN_MEMORY)
         found = self._read_depth(depth, name, size, scale)
         return self._at_scale_of_map(QueryImage(name, pixels, camera, found, None, None))
 
     def _of_file(self, path: Path, depth: Depth | None) -> QueryImage:
         data = read_bytes(path)
         found = self._on_disk.around(path, self._paths, self._tell)
-        way_out = "--camera fx,fy,cx,cy[,k1,k2,p1,p2,k3], or --like RECORDING"
-        return self._of_bytes(data, str(path), depth, found, way_out)
+        return self._of_bytes(data, str(path), depth, found, _IN_FILES)
 
     def _of_bytes(
-        self, data: bytes, name: str, depth: Depth | None, found: tuple[Recording, FrameEntry] | None, way_out: str
+        self, data: bytes, name: str, depth: Depth | None, found: tuple[Recording, FrameEntry] | None, way_out: _WayOut
     ) -> QueryImage:
         """A file in memory. A large JPEG is made smaller while it is decoded, so that it takes no more memory."""
         header = header_of(data, name)
@@ -218,7 +232,7 @@ class QueryReader:
         return as_depth(depth, name, size, scale if whole else self._depth_scale)
 
     def _camera_of(
-        self, name: str, size: tuple[int, int], found: tuple[Recording, FrameEntry] | None, way_out: str
+        self, name: str, size: tuple[int, int], found: tuple[Recording, FrameEntry] | None, way_out: _WayOut
     ) -> tuple[Camera, float | None]:
         like_scale = None if self._like is None else self._like.depth_scale
         scale = self._depth_scale or like_scale or (found[0].depth_scale if found else None)
@@ -242,7 +256,29 @@ class QueryReader:
             return fitting.pop(), scale
         if self._nominal:
             return Camera(*size, size[0], size[0], (size[0] - 1) / 2, (size[1] - 1) / 2), scale
-        raise FrameError(f"the camera of {name} ({size[0]}x{size[1]}) is not known: give {way_out}")
+        raise FrameError(f"the camera of {name} ({size[0]}x{size[1]}) is not known: {self._why_unknown(size, way_out)}")
+
+    def _why_unknown(self, size: tuple[int, int], way_out: _WayOut) -> str:
+        """What keyframes say of cameras, and how to choose."""
+        if not self._map_cameras():
+            return f"give {way_out.camera}"
+        fitting = [one for one in self._used() if (one.camera.width, one.camera.height) == size]
+        took: dict[str, list[UsedCamera]] = {}
+        for one in fitting:
+            took.setdefault(camera_numbers(one.camera), []).append(one)
+        if len(took) < 2:
+            sizes = sorted({f"{camera.width}x{camera.height}" for camera in self._map_cameras()})
+            return f"the keyframes' images are {', '.join(sizes[:3])}; give {way_out.camera}"
+        texts = [
+            f"{text} (recording {of[0].recording!r} in map {of[0].map!r}"
+            + f", {len(of) - 1} more" * (len(of) > 1)
+            + ")"
+            for text, of in took.items()
+        ]
+        by_map = len({one.map for one in fitting}) > 1
+        choose = f"choose the map ({way_out.map}), or give {way_out.camera}" if by_map else f"give {way_out.camera}"
+        more = f", and {len(texts) - 3} more" if len(texts) > 3 else ""
+        return f"keyframes of that size have {len(texts)} cameras, {', '.join(texts[:3])}{more}: {choose}"
 
     def _tell_assumed(self, origin: str, assumed: Sequence[str]) -> None:
         for line in assumed:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import json
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -157,6 +159,45 @@ def test_an_array_with_its_depth_and_camera(
     close_to(db.localize(grey, camera=camera), frame)
 
 
+def test_recordings_that_disagree_on_the_camera(
+    open_file: Opening, room: Path, frames: list[Frame], networks: dict[str, str], tmp_path: Path
+) -> None:
+    """A photo whose camera was plain stays so with one word more, and which word is said."""
+    db = open_file(**networks)
+    db.ingest(room, map="office", stride=STRIDE)
+    image = frames[6].image
+    close_to(db.localize(image), frames[6])
+    other = shutil.copytree(room, tmp_path / "other")
+    camera = json.loads((other / "camera.json").read_text())
+    (other / "camera.json").write_text(json.dumps({**camera, "fx": 301.5}))
+    fx, *rest = (f"{camera[name]:g}" for name in ("fx", "fy", "cx", "cy"))
+    first, second = ",".join([fx, *rest]), ",".join(["301.5", *rest])
+
+    db.ingest(other, map="attic", name="night", keyframes=2, check=False)
+    with pytest.raises(FrameError) as caught:
+        db.localize(image)
+    assert str(caught.value) == (
+        f"the camera of image (320x240) is not known: keyframes of that size have 2 cameras, {first} (recording "
+        f"{room.name!r} in map 'office'), {second} (recording 'night' in map 'attic'): choose the map (map=), or give "
+        "camera=(fx, fy, cx, cy), or like=RECORDING"
+    )
+    close_to(db.localize(image, map="office"), frames[6])
+    close_to(db.localize(image, like=room.name), frames[6])
+
+    db.ingest(other, map="office", name="night", keyframes=2, check=False)
+    photo = tmp_path / "photo.png"
+    cv2.imwrite(str(photo), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    with pytest.raises(FrameError) as caught:
+        db.localize(photo, map="office")
+    assert str(caught.value) == (
+        f"the camera of {photo} (320x240) is not known: keyframes of that size have 2 cameras, {first} (recording "
+        f"{room.name!r} in map 'office'), {second} (recording 'night' in map 'office'): give --camera fx,fy,cx,cy"
+        "[,k1,k2,p1,p2,k3], or --like RECORDING"
+    )
+    with pytest.raises(FrameError, match=r"image \(100x240\) is not known: the keyframes' images are 320x240; give"):
+        db.localize(image[:, :100])
+
+
 def test_arrays_that_make_no_sense_are_refused(
     open_file: Opening, room: Path, frames: list[Frame], networks: dict[str, str]
 ) -> None:
@@ -165,7 +206,7 @@ def test_arrays_that_make_no_sense_are_refused(
     image, depth = frames[6].image, frames[6].depth
     for given, error, words in (
         ({"image": image / np.float32(255)}, FrameError, r"image: an image has values of uint8 .* \(255 \* image\)"),
-        ({"image": image[:, :100]}, FrameError, "the camera of image .100x240. is not known: give camera="),
+        ({"image": image[:, :100]}, FrameError, "the camera of image .100x240. is not known: .*; give camera="),
         ({"image": image, "camera": (500, 500, 160)}, UsageError, "3 numbers"),
         ({"image": image, "camera": replace(frames[6].camera, width=640)}, FrameError, "its camera is 640x240"),
         ({"image": image, "depth": depth[:100]}, FrameError, r"depth of image: depth has the shape \[100, 320\]"),
