@@ -13,7 +13,9 @@ import math
 import os
 import re
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -45,6 +47,9 @@ _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 _LONGEST_NUMBER = 1000  # characters; more take Python long
 
 
+_below: ContextVar[tuple[Path, ...]] = ContextVar("_below", default=())
+
+
 class UnusableFileError(SemdbError):
     """Why a file cannot be used, without its name; `line` (from 1) where it is one line of it."""
 
@@ -59,6 +64,35 @@ class UnusableFileError(SemdbError):
 
 class MissingFileError(UnusableFileError):
     """There is no such file."""
+
+
+def places() -> tuple[Path, ...]:
+    """The folders below which files may lie here and now; () for anywhere: see `only_below`."""
+    return _below.get()
+
+
+@contextmanager
+def only_below(folders: Sequence[Path]) -> Iterator[None]:
+    """Refuses files that lie elsewhere, whatever links and ``..`` lead there; () refuses none. Of this thread only.
+
+    `folders` are resolved. Who may name recordings need not be let read all files.
+    """
+    before = _below.set(tuple(folders))
+    try:
+        yield
+    finally:
+        _below.reset(before)
+
+
+def check_place(path: Path, opened: int | None = None) -> None:
+    """For a file that another library opens; `opened` is its number where it is open. Raises UnusableFileError."""
+    folders = _below.get()
+    if not folders:
+        return
+    number = "" if opened is None else f"/proc/self/fd/{opened}"  # which cannot be exchanged any more
+    real = Path(os.path.realpath(number if number and os.path.exists(number) else path))
+    if not any(real.is_relative_to(folder) for folder in folders):
+        raise UnusableFileError("lies outside of where recordings may lie (SEMDB_RECORDING_ROOTS)")
 
 
 def open_regular(path: Path, most_bytes: int | None = None) -> BinaryIO:
@@ -77,6 +111,7 @@ def open_regular(path: Path, most_bytes: int | None = None) -> BinaryIO:
     try:
         found = os.fstat(number)
         _check_kind(found)  # it may have been exchanged meanwhile
+        check_place(path, number)
         if most_bytes is not None and found.st_size > most_bytes:
             raise UnusableFileError(
                 f"the file is too large: {megabytes(found.st_size)}, at most {megabytes(most_bytes)}"

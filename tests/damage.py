@@ -61,6 +61,11 @@ _READ_BY = {
     "plot": {"cameras", "keyframe_images", "objects"},
     "refine": {"cameras", "descriptors", "keyframes", "keypoints", "object_features", "objects", "refinements"},
 }
+_READ_TOO = {  # in passing: once with each damage of any kind
+    "index": {"map_models", "maps", "models"},
+    "plot": {"categories", "keyframes", "recordings", "refined_points"},
+    "refine": {"class_confusions", "maps", "models", "recordings", "refined_points"},
+}
 HUGE, NOTHING = 2**62, 987_654_321
 
 
@@ -326,7 +331,7 @@ class Reader:
         if table in OF_KEYFRAMES or self.thick:
             found["keypoints"] = self.keypoints
         for name, operation in (("index", self.index), ("plot", self.plot), ("refine", self.refine)):
-            if table in _READ_BY[name] or self.thick:
+            if table in _READ_BY[name] or (self.thick and table in _READ_TOO[name]):
                 found[name] = operation
         return found
 

@@ -6,20 +6,30 @@ be lost or arrive twice, and running a task again adds nothing.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 try:
     from celery import Celery
+    from kombu.transport import TRANSPORT_ALIASES
 except ImportError as error:
     raise ImportError("semdb.workers needs the worker extra: pip install 'semdb[worker]'") from error
 
 from semdb.errors import SemdbError
+from semdb.events import event
 from semdb.settings import Settings
 
+# Kombu's own end a worker over an item that is no message.
+ALIASES = {
+    "redis": "semdb.workers.broker:CarefulTransport",
+    "rediss": "semdb.workers.broker:CarefulTransport",
+    "sentinel": "semdb.workers.broker:CarefulSentinelTransport",
+}
 INGEST_TASK = "semdb.ingest_recording"
 ITEMS_TASK = "semdb.ingest_items"
+LONGEST = 200  # characters of a line about what anybody may have sent
 SOFT_LIMIT_S = 600  # for the keyframes of one message
 HARD_LIMIT_S = SOFT_LIMIT_S + 60
 SOCKET_LIMITS = {"socket_timeout": 10, "socket_connect_timeout": 5}
@@ -40,6 +50,7 @@ class Node:
 
 def make_app(settings: Settings) -> Any:
     """The Celery application for `settings`; its tasks are found by name when a worker starts."""
+    TRANSPORT_ALIASES.update(ALIASES)  # by name: the client of Redis is only needed for Redis
     application = Celery("semdb", broker=settings.broker_url, include=["semdb.workers.tasks", "semdb.workers.process"])
     application.conf.update(
         task_ignore_result=True,  # the database holds the outcome
@@ -88,6 +99,15 @@ def send_items(recording_id: int, source: str, frames: Sequence[int], *, delay_s
             f"the broker {where} does not answer ({error}); the plan is in the database: when the broker is back, run "
             "`semdb ingest --resume`"
         ) from error
+
+
+def say_refused(error: Exception) -> None:
+    """Says that what somebody put into the broker is no message: once, for it is gone from there."""
+    from . import metrics
+
+    metrics.fault("refused")
+    first = str(error).partition("\n")[0][:LONGEST]
+    event("given_up", level=logging.ERROR, error=f"a message that is none: {type(error).__name__}: {first}")
 
 
 def nodes(settings: Settings, seconds: float = 1.0) -> list[Node]:

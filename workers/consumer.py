@@ -12,11 +12,8 @@ from typing import Any
 
 from celery.worker.consumer import Consumer
 
-from semdb.events import event
+from . import LONGEST, again, say_refused
 
-from . import again, metrics
-
-LONGEST = 200  # characters of a line about what anybody may have sent
 FOLLOWERS = ("callbacks", "errbacks", "chain")
 _TEXTS = ("task", "id", "lang", "eta", "expires", "root_id", "parent_id", "group", "origin", "argsrepr", "kwargsrepr")
 _HEADERS: dict[str, tuple[type, ...]] = {**dict.fromkeys(_TEXTS, (str,)), "redelivered": (bool,)}
@@ -87,8 +84,6 @@ class CarefulConsumer(Consumer):  # type: ignore[misc]
         self._refuse(message, exc)
 
     def _refuse(self, message: Any, error: Exception) -> None:
-        metrics.fault("refused")
-        first = str(error).partition("\n")[0][:LONGEST]
-        event("given_up", level=logging.ERROR, error=f"a message that is none: {type(error).__name__}: {first}")
+        say_refused(error)
         if not message.acknowledged:
             message.reject_log_error(logging.getLogger("celery"), self.connection_errors)

@@ -32,9 +32,8 @@ from semdb.ingestion.run import (
 from semdb.ingestion.work import Item, work_off
 from semdb.perception.describe import Describer
 from semdb.perception.model_choice import ModelSpecs, settings_of_map, specs_for_ingest
-from semdb.recordings import open_recordings
 from semdb.recordings.base import Recording
-from semdb.recordings.source import locate, parse_source
+from semdb.recordings.source import locate, open_located, parse_source
 from semdb.settings import Settings
 
 CHUNK = 16  # keyframes of one message
@@ -232,7 +231,7 @@ class Workplace:
                 f"{folder}: no such folder or file on this machine; workers must see recordings under the path "
                 "or URL that was given to `semdb ingest --queue`"
             )
-        opened = open_recordings(folder, found.parsed_camera, found.options)
+        opened = open_located(folder, self._settings, found.parsed_camera, found.options)
         if len(opened) != 1:
             raise RecordingError(f"{folder}: on this machine there are {len(opened)} recordings, and one was planned")
         recording = opened[0]

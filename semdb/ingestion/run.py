@@ -26,11 +26,11 @@ from semdb.ingestion.work import STAGES, Item, log_item, work_off
 from semdb.names import storable
 from semdb.perception.describe import Describer, describer_from_specs
 from semdb.perception.model_choice import ModelSpecs, settings_of_map, specs_for_ingest
-from semdb.recordings import open_recordings, parse_camera
+from semdb.recordings import parse_camera
 from semdb.recordings.base import DroppedFrame, FrameEntry, Recording
 from semdb.recordings.focus import watched
 from semdb.recordings.options import AS_THE_FORMAT_SAYS, ReadOptions
-from semdb.recordings.source import locate, write_source
+from semdb.recordings.source import locate, open_located, write_source
 from semdb.settings import Settings
 from semdb.types import ModelInfo
 
@@ -200,7 +200,7 @@ def open_all(
     recordings = []
     for path in paths:
         with watched(None if progress is None else partial(progress, f"looking at the files of {path}")):
-            found = open_recordings(locate(str(path), settings), camera, options.reading)
+            found = open_located(locate(str(path), settings), settings, camera, options.reading)
         for recording in found:
             below = recording.path.name if recording.path.name != Path(str(path)).name else None
             address = str(path) if below is None else f"{path}/{below}"

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semdb.errors import FrameError
+from semdb.files import only_below, places
 from semdb.recordings.images import (
     decode_16bit,
     decode_color,
@@ -117,6 +118,7 @@ class Recording:
     contents: tuple[str, ...] = ()  # what else the file holds and what is taken of it, a line each for people
     decode_failures: list[DroppedFrame] = field(default_factory=list)
     remarks: list[DroppedFrame] = field(default_factory=list)
+    below: tuple[Path, ...] = field(default_factory=places)  # where its files may lie; (): anywhere
     _failed: set[str] = field(default_factory=set)  # names of those
 
     @property
@@ -172,7 +174,8 @@ class Recording:
         name = str(entry.masks_path)
         camera = self.camera_of(entry)
         size = (camera.width, camera.height)
-        labels = decode_16bit(read_bytes(entry.masks_path), name, size, "an image of masks")
+        with only_below(self.below):
+            labels = decode_16bit(read_bytes(entry.masks_path), name, size, "an image of masks")
         unknown = sorted(set(np.unique(labels).tolist()) - {0} - set(self.categories))
         if unknown:
             raise FrameError(f"{name}: label {unknown[0]} is not in masks/classes.json")
@@ -208,10 +211,8 @@ class Recording:
 
     def _color(self, entry: FrameEntry) -> tuple[ImageArray, bytes | None]:
         """Pixels, and the file where there is one."""
-        if self.data is None:
-            file = read_bytes(entry.image_path)
-            return decode_color(file, self.name_of(entry)), file
-        raw = self.data.color(entry)
+        with only_below(self.below):
+            raw = RawColor(file=read_bytes(entry.image_path)) if self.data is None else self.data.color(entry)
         if raw.pixels is not None:
             return raw.pixels, raw.file
         file = raw.file or b""
@@ -223,11 +224,13 @@ class Recording:
             return None, None, None
         camera = self.camera_of(entry)
         if self.data is None:
-            data = read_bytes(entry.depth_path)
+            with only_below(self.below):
+                data = read_bytes(entry.depth_path)
             size = depth_size(camera, self.depth_registration)
             depth = decode_depth(data, str(entry.depth_path), self.depth_scale, size)
             return register_depth(depth, self.depth_registration, camera), data, self.depth_scale
-        raw = self.data.depth(entry)
+        with only_below(self.below):
+            raw = self.data.depth(entry)
         if raw is None:
             return None, None, None
         if raw.values.shape != (camera.height, camera.width):

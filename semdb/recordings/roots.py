@@ -21,6 +21,17 @@ def check_root(address: str, roots: Sequence[str]) -> None:
         raise UsageError(f"{address}: recordings may lie below {', '.join(roots)} only (SEMDB_RECORDING_ROOTS)")
 
 
+def places_of(roots: Sequence[str], copies: Path) -> tuple[Path, ...]:
+    """The folders below which files of recordings may lie, for `semdb.files.only_below`; () where that is anywhere.
+
+    `copies` is where those of URLs are.
+    """
+    if not roots:
+        return ()
+    folders = [folder for folder in map(_folder, roots) if folder is not None]
+    return tuple(folder.resolve() for folder in (*folders, copies))
+
+
 def _is_below(address: str, root: str) -> bool:
     folder, base = _folder(address), _folder(root)
     if folder is not None and base is not None:

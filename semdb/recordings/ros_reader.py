@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from semdb.errors import FrameError, RecordingError, UsageError
+from semdb.files import UnusableFileError, check_place
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 INFO, TF = "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage"
@@ -65,6 +66,11 @@ class Bag:
             from rosbags.typesys import Stores, get_typestore
         except ImportError as error:
             raise UsageError(f"{path}: bags need the ros extra: pip install 'semdb[ros]'") from error
+        for file in [path, *path.iterdir()] if path.is_dir() else [path]:
+            try:
+                check_place(file)
+            except UnusableFileError as error:
+                raise RecordingError(error.at(file)) from error
         try:
             files = _files(path)
             self._reader: Any = AnyReader(files, default_typestore=get_typestore(Stores.LATEST))

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semdb.errors import FrameError, RecordingError
+from semdb.files import UnusableFileError, check_place
 from semdb.recordings.assembly import Draft, finish
 from semdb.recordings.base import DroppedFrame, FrameEntry, Layout, RawColor, RawDepth, Recording
 from semdb.recordings.cameras import with_size
@@ -378,6 +379,10 @@ def _time_ns(stamp: Any) -> int | None:
 
 def _connect(path: Path) -> sqlite3.Connection:
     """Read only, also while RTAB-Map has it open, or where nothing may be written beside it."""
+    try:
+        check_place(path)
+    except UnusableFileError as error:
+        raise RecordingError(error.at(path)) from error
     address = f"{path.absolute().as_uri()}?mode=ro"
     connection = sqlite3.connect(address, uri=True, check_same_thread=False, timeout=5)
     try:

@@ -16,11 +16,14 @@ from pathlib import Path
 from typing import Any
 
 from semdb.errors import RecordingError, RecordingUnavailableError, UsageError
+from semdb.files import only_below
 from semdb.names import path_text, written
+from semdb.recordings import open_recordings
+from semdb.recordings.base import Recording
 from semdb.recordings.cameras import parse_camera
 from semdb.recordings.credentials import refuse_credentials
 from semdb.recordings.options import AS_THE_FORMAT_SAYS, ReadOptions, read_options, write_options
-from semdb.recordings.roots import check_root
+from semdb.recordings.roots import check_root, places_of
 from semdb.settings import Settings
 from semdb.types import Camera
 
@@ -80,6 +83,17 @@ def parse_source(source: str) -> Source:
     return Source(path_text(source[: found.start()]), camera, read_options(said))
 
 
+def open_located(
+    folder: Path, settings: Settings, camera: Camera | None = None, options: ReadOptions | None = None
+) -> list[Recording]:
+    """The recordings of what `locate` gave, of files that lie where recordings may lie, and no others.
+
+    Raises what `open_recordings` raises.
+    """
+    with only_below(places_of(settings.roots, _copies(settings))):
+        return open_recordings(folder, camera, options)
+
+
 def locate(address: str, settings: Settings) -> Path:
     """The folder on this machine: `address` itself, or the copy of a URL, brought up to date.
 
@@ -91,7 +105,11 @@ def locate(address: str, settings: Settings) -> Path:
     check_root(address, settings.roots)
     if not is_address(address):
         return Path(address)
-    return fetch(address, settings.cache_dir.expanduser() / "recordings")
+    return fetch(address, _copies(settings))
+
+
+def _copies(settings: Settings) -> Path:
+    return settings.cache_dir.expanduser() / "recordings"
 
 
 def fetch(address: str, cache: Path) -> Path:

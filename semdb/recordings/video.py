@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from semdb.errors import FrameError
+from semdb.files import UnusableFileError, check_place
 from semdb.recordings.headers import MOST_PIXELS
 from semdb.types import ImageArray
 
@@ -59,6 +60,10 @@ class Video:
             self._capture.release()
         if not self._path.is_file():
             raise FrameError(f"{self._path}: the file is missing")
+        try:
+            check_place(self._path)
+        except UnusableFileError as error:
+            raise FrameError(error.at(self._path)) from error
         level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the error below says it all
         capture = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG)
         cv2.utils.logging.setLogLevel(level)

@@ -176,10 +176,12 @@ def push(port: int, body: Any, headers: Any, content_type: str = "application/js
     redis(port, "LPUSH", "semdb", json.dumps(message))
 
 
-def redis(port: int, *words: str) -> bytes:
+def redis(port: int, *words: str | bytes) -> bytes:
     """What Redis answers, as it writes it."""
     parts = [f"*{len(words)}\r\n".encode()]
-    parts += [b"$%d\r\n%s\r\n" % (len(word.encode()), word.encode()) for word in words]
+    for word in words:
+        data = word if isinstance(word, bytes) else word.encode()
+        parts.append(b"$%d\r\n%s\r\n" % (len(data), data))
     with socket.create_connection(("127.0.0.1", port), 5) as connection:
         connection.sendall(b"".join(parts))
         return connection.recv(4096)
@@ -253,6 +255,51 @@ def test_a_worker_among_poisoned_messages_does_its_work(room: Path, tmp_path: Pa
         assert seconds < 60
         assert store.failed_items() == []
         assert [info.name for info in store.maps()] == ["m"]
+
+
+def test_a_worker_among_rubbish_does_its_work(room: Path, tmp_path: Path) -> None:
+    """What is no message at all, in the list, among what workers have in hand, and in what all of them listen to."""
+    url = f"sqlite:///{tmp_path / 'a.sqlite3'}"
+    specs = {"SEMDB_DETECTOR": "recorded", "SEMDB_ENCODER": "gist", "SEMDB_FEATURES": "orb"}
+    right = {
+        "body": base64.b64encode(b"[[],{},{}]").decode(), "content-encoding": "utf-8",
+        "content-type": "application/json", "headers": {},
+        "properties": {
+            "body_encoding": "base64", "delivery_tag": "t", "delivery_info": {"exchange": "", "routing_key": "semdb"},
+        },
+    }  # fmt: skip
+
+    def changed(**properties: Any) -> str:
+        return json.dumps({**right, "properties": {**right["properties"], **properties}})  # type: ignore[dict-item]
+
+    rubbish = [
+        "rubbish", "", "5", "null", "[]", "{}", '{"properties": 5}', '{"properties": {}}', '"x"', "[" * 100_000,
+        b"\xff\xfe\x00", '{"__type__": "datetime", "__value__": 5}', '{"__type__": "decimal", "__value__": "x"}',
+        changed(delivery_tag=None), changed(delivery_tag=["a"]), changed(delivery_tag="\ud800"),
+        changed(delivery_info=None), changed(delivery_info={}), changed(body_encoding="rot13"),
+        json.dumps({**right, "body": 5}), json.dumps({**right, "body": "a"}), json.dumps({**right, "headers": [1]}),
+        json.dumps({**right, "content-type": {}}), json.dumps({**right, "headers": {"compression": "zlib"}}),
+    ]  # fmt: skip
+    with services.redis(tmp_path) as broker, open_store(url, create=True) as store:
+        sender = make_app(settings(url, tmp_path).model_copy(update={"broker_url": broker.url}))
+        for item in rubbish:
+            assert redis(broker.port, "LPUSH", "semdb", item).startswith(b":")
+        in_hand = ["rubbish", "{}", "[1, 2, 3]", '[{"headers": 5}, "", "semdb"]', b"\xff"]
+        for number, item in enumerate(in_hand):
+            redis(broker.port, "HSET", "unacked", f"tag{number}", item)
+            redis(broker.port, "ZADD", "unacked_index", str(number + 1), f"tag{number}")
+        worker = services.start_worker(tmp_path, url, broker.url, **specs)
+        with services.workers(worker):
+            services.wait_until(
+                lambda: worker.text().count("given_up") >= len(rubbish) + len(in_hand), "all are refused"
+            )
+            assert "Traceback" not in worker.text(), worker.text()
+            for item in ("rubbish", "5", "{}", changed(), '{"properties": {"delivery_tag": 5}}'):
+                assert redis(broker.port, "PUBLISH", "/0.celery.pidbox", item) == b":1\r\n"  # it listens
+            sender.send_task(INGEST_TASK, args=[str(room), "m", None, {"stride": 4}])
+            services.wait_until(lambda: stored(store) == 6 and is_complete(store), "the good recording is stored", 60)
+            services.wait_until(lambda: redis(broker.port, "LLEN", "semdb") == b":0\r\n", "no message is left")
+            services.wait_until(lambda: redis(broker.port, "HLEN", "unacked") == b":0\r\n", "none is in hand", 60)
 
 
 KILLS = """
