@@ -260,6 +260,14 @@ def corrected(trajectory: Trajectory, options: ReadOptions) -> Trajectory:
     return Trajectory(times, quats, np.stack([pose[:3, 3] for pose in poses]))
 
 
+def backwards(trajectory: Trajectory, times_ns: Sequence[int]) -> Trajectory:
+    """The trajectory run through from the last of the colour images' times to the first."""
+    if not times_ns:
+        return trajectory
+    times = min(times_ns) + max(times_ns) - trajectory.time_ns[::-1]
+    return Trajectory(times, trajectory.quat_wxyz[::-1], trajectory.translation[::-1])
+
+
 def decimal_commas_note(file_name: str) -> str:
     """One sentence for people about numbers that were read in another notation than is usual."""
     return f"{file_name}: numbers with decimal commas (1,5) are read as such"

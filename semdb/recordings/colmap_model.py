@@ -63,6 +63,8 @@ def open_colmap(path: Path, camera: Camera | None = None, options: ReadOptions |
             straighteners[image.image_id] = straight
         entries.append(FrameEntry(image.image_id, image.name, None, root / image.name, None, None, pose, camera=own))
     notes.append("COLMAP's model has no depth: `semdb refine` triangulates the points of keypoints")
+    if options.up is None and not is_metric(folder):
+        notes.append("nothing says which way is up: the axes are the model's; --up x,y,z or --up cameras makes z of it")
     draft = Draft(
         path=path,
         name=path.resolve().name,
@@ -105,14 +107,20 @@ class _StraightData:
         return None
 
 
+def is_metric(folder: Path) -> bool:
+    """Whether semdb wrote the model, of a map of its own."""
+    text = folder / "cameras.txt"
+    return not (folder / "cameras.bin").is_file() and text.is_file() and METRIC in read_text(text, escape=True)[:4096]
+
+
 def _scale(folder: Path, options: ReadOptions, path: Path) -> float:
     if options.scale is not None:
         return options.scale
-    text = folder / "cameras.txt"
-    if not (folder / "cameras.bin").is_file() and text.is_file() and METRIC in read_text(text, escape=True)[:4096]:
+    if is_metric(folder):
         return 1.0
     raise UsageError(
-        f"{path}: a model of COLMAP has no scale: give --scale N, the metres of one unit (1 where it was made metric)"
+        f"{path}: a model of COLMAP has no scale: give --scale N, the metres of one unit (1 where it was made metric), "
+        "and --up x,y,z (or cameras), since it has no up either"
     )
 
 

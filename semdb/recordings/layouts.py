@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 from semdb.errors import RecordingError, RecordingUnavailableError, UsageError
@@ -45,6 +45,7 @@ LAYOUTS: tuple[Layout, ...] = (
     colmap_model.LAYOUT,
 )
 CHILDREN_LOOKED_AT = 200
+EVERYWHERE = frozenset({"up"})
 
 
 def find_layout(path: Path) -> Layout | None:
@@ -54,17 +55,31 @@ def find_layout(path: Path) -> Layout | None:
 
 def open_with(layout: Layout, path: Path, camera: Camera | None, options: ReadOptions) -> list[Recording]:
     """Opens `path`. Raises UsageError for an option that means nothing to this layout, RecordingError."""
-    foreign = sorted(set(options.given()) - layout.takes)
+    foreign = sorted(set(options.given()) - layout.takes - EVERYWHERE)
     if foreign:
         names = ", ".join(option_of(name) for name in foreign)
-        fitting = [option_of(field.name) for field in fields(ReadOptions) if field.name in layout.takes]
+        fitting = [option_of(field.name) for field in fields(ReadOptions) if field.name in layout.takes | EVERYWHERE]
         raise UsageError(f"{path}: {names} means nothing to a recording of format {layout.name}; it takes {fitting}")
     if options.depth_scale is not None and (problem := depth_scale_problem(options.depth_scale)):
         raise UsageError(f"--depth-scale: {problem}")
     found = layout.open(path, camera, options)
     for recording in found:
         recording.reading, recording.takes = options, layout.takes
+        set_upright(recording)
     return found
+
+
+def set_upright(recording: Recording) -> None:
+    """Turns the world of a recording so that what its reading says is up becomes z. Raises UsageError."""
+    poses = [entry.world_from_camera for entry in recording.entries if entry.world_from_camera is not None]
+    turn = recording.world_turn = recording.reading.turn(poses)
+    if turn is not None:
+        recording.entries = tuple(
+            entry
+            if entry.world_from_camera is None
+            else replace(entry, world_from_camera=turn @ entry.world_from_camera)
+            for entry in recording.entries
+        )
 
 
 def not_a_recording(path: Path) -> RecordingError:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from urllib.parse import quote, unquote
 
 import numpy as np
 
 from semdb.errors import UsageError
-from semdb.geometry import invert_pose, pose_from
+from semdb.geometry import invert_pose, pose_from, so3_exp
 from semdb.types import FloatArray
 
 WORLD_FROM_CAMERA, CAMERA_FROM_WORLD = "world_from_camera", "camera_from_world"
@@ -20,6 +20,8 @@ BACK = np.diag([1.0, -1.0, -1.0, 1.0])
 BODY = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 AXES: Mapping[str, FloatArray] = {"opencv": np.eye(4), "opengl": BACK, "arkit": BACK, "ros": BODY}
 QUATERNIONS = ("xyzw", "wxyz")
+REVERSED = "reversed"
+BY_CAMERAS = "cameras"  # up is where the cameras' is
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,8 +30,9 @@ class ReadOptions:
 
     `depth_scale` is units per metre of depth files. `poses_are` and `axes` say what the poses in the files are of,
     `quaternion` in which order they have their numbers. `time_offset_ms` is added to the times of poses,
-    `depth_offset_ms` to those of depth, to get those of colour. `scale` is metres per unit of poses.
-    Topics and frames are of ROS bags.
+    `depth_offset_ms` to those of depth, to get those of colour; `times` "reversed" says that poses run backwards
+    through them. `scale` is metres per unit of poses, `up` "x,y,z" (or "cameras") the direction in their world that
+    becomes z. Topics and frames are of ROS bags.
     """
 
     depth_scale: float | None = None
@@ -38,7 +41,9 @@ class ReadOptions:
     quaternion: str | None = None
     time_offset_ms: float = 0.0
     depth_offset_ms: float = 0.0
+    times: str | None = None
     scale: float | None = None
+    up: str | None = None
     color_topic: str | None = None
     depth_topic: str | None = None
     info_topic: str | None = None
@@ -48,6 +53,9 @@ class ReadOptions:
         _check_choice("--poses-are", self.poses_are, (WORLD_FROM_CAMERA, CAMERA_FROM_WORLD))
         _check_choice("--axes", self.axes, tuple(AXES))
         _check_choice("--quaternion", self.quaternion, QUATERNIONS)
+        _check_choice("--times", self.times, (REVERSED,))
+        if self.up is not None:
+            self.turn([])
         for name in ("depth_scale", "scale"):
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0):
@@ -74,10 +82,42 @@ class ReadOptions:
             found = pose_from(found[:3, :3], found[:3, 3] * self.scale)
         return found
 
+    def turn(self, poses: Sequence[FloatArray]) -> FloatArray | None:
+        """What turns the world of `poses` (``[4, 4]``, read already) so that `up` becomes z; None where nobody said up.
+
+        Raises UsageError for what is no direction, or where "cameras" have none in common.
+        """
+        if self.up is None:
+            return None
+        if self.up == BY_CAMERAS:
+            return upright(-np.mean([pose[:3, 1] for pose in poses], axis=0)) if len(poses) else np.eye(4)
+        try:
+            up = np.array([float(part) for part in self.up.split(",")])
+        except ValueError:
+            up = np.empty(0)
+        if up.shape != (3,) or not np.isfinite(up).all():
+            raise UsageError(f"--up takes x,y,z or {BY_CAMERAS}, but is {self.up!r}")
+        return upright(up)
+
     @property
     def changes_poses(self) -> bool:
         """Whether `pose` does anything."""
         return self.poses_are != WORLD_FROM_CAMERA or self.axes not in (None, "opencv") or self.scale is not None
+
+
+def upright(up: FloatArray) -> FloatArray:
+    """The shortest turn ``[4, 4]`` that makes z of the direction `up`. Raises UsageError where it has none."""
+    length = float(np.linalg.norm(up))
+    if not length > 1e-3:
+        raise UsageError(f"--up {','.join(f'{value:g}' for value in up)}: no direction is up in it; give x,y,z")
+    unit = up / length
+    axis = np.cross(unit, [0.0, 0.0, 1.0])
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-9:
+        axis, sine = np.array([1.0, 0.0, 0.0]), 1.0  # z already, or a half turn about x
+    return pose_from(
+        so3_exp(axis / sine * np.arctan2(np.linalg.norm(np.cross(unit, [0.0, 0.0, 1.0])), unit[2])), np.zeros(3)
+    )
 
 
 def option_of(name: str) -> str:

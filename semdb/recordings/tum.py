@@ -18,6 +18,7 @@ from semdb.recordings.association import (
     MAX_TIME_DIFFERENCE_NS,
     TimedFile,
     Trajectory,
+    backwards,
     bad_lines_note,
     has_times,
     nearest_pairs,
@@ -30,7 +31,7 @@ from semdb.recordings.association import (
 from semdb.recordings.base import DroppedFrame, FrameEntry, Layout, Recording
 from semdb.recordings.cameras import TUM_DEPTH_SCALE, tum_camera
 from semdb.recordings.focus import is_wanted
-from semdb.recordings.options import ReadOptions
+from semdb.recordings.options import REVERSED, ReadOptions
 from semdb.shown import measure
 from semdb.storable_names import name_problem
 from semdb.types import Camera
@@ -142,7 +143,7 @@ def _read_poses(path: Path, notes: list[str], options: ReadOptions, times_ns: Se
         return None
     trajectory, pose_notes = read_trajectory(path / "groundtruth.txt", options, times_ns)
     notes += pose_notes
-    return trajectory
+    return backwards(trajectory, times_ns) if options.times == REVERSED else trajectory
 
 
 def _set_camera(draft: Draft, path: Path, name: str, camera: Camera | None, options: ReadOptions) -> None:
@@ -215,5 +216,7 @@ LAYOUT = Layout(
     "TUM RGB-D (rgb.txt, depth.txt, groundtruth.txt)",
     is_tum,
     lambda path, camera, options: [open_tum(path, camera, options)],
-    frozenset({"depth_scale", "poses_are", "axes", "scale", "quaternion", "time_offset_ms", "depth_offset_ms"}),
+    frozenset(
+        {"depth_scale", "poses_are", "axes", "scale", "quaternion", "time_offset_ms", "depth_offset_ms", "times"}
+    ),
 )

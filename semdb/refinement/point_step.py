@@ -40,13 +40,16 @@ class PointStep:
         listed = [item.id for item in store.listed_keyframes(map_id)]
         numbers, volumes, counts = ClassNumbers(), {}, {}
         kinds: dict[int, tuple[str, int]] = {}  # of descriptors
+        measured = False
         for start in range(0, len(listed), READ_CHUNK):
             for known in store.load_keyframes(listed[start : start + READ_CHUNK], bad=store.left_out):
                 xy, described = known.keypoints.features.xy, known.keypoints.features.descriptors
                 volumes[known.id] = volume_of(known.camera, known.world_from_camera, xy, known.keypoints.points)
+                measured = measured or bool(np.isfinite(known.keypoints.points).any())
                 counts[known.id], kinds[known.id] = len(xy), (str(described.dtype), described.shape[1])
             progress(min(start + READ_CHUNK, len(listed)), 2 * len(listed))
         ids = _comparable(listed, kinds, store)
+        options = self.options if measured else self.options.without_depth(len(ids))
 
         def load(number: int) -> View:
             (known,) = store.load_keyframes([ids[number]])
@@ -57,7 +60,7 @@ class PointStep:
             progress(total + done, 2 * total)
 
         results = []
-        for number, found in refine_points([volumes[key] for key in ids], load, self.options, show):
+        for number, found in refine_points([volumes[key] for key in ids], load, options, show):
             points = np.full((counts[ids[number]], 4), np.nan, np.float32)
             points[found.keypoints] = found.points
             results.append(KeyframePoints(ids[number], points, found.fused, found.triangulated))

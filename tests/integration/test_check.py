@@ -14,7 +14,7 @@ import pytest
 from semdb.database.findings import list_findings
 from semdb.database.store import open_store
 from semdb.geometry import invert_pose, pose_from, quat_wxyz_from_rotation, rotation_from_quat_wxyz
-from semdb.recordings import Recording, open_recording
+from semdb.recordings import Recording, open_recording, parse_camera
 from semdb.recordings.check import Finding, Report, check_recording
 from semdb.recordings.check.pairs import look, match
 from semdb.recordings.check.readings import Reading, readings, reread
@@ -61,10 +61,13 @@ def the_finding(recording: Recording, kind: str) -> Finding:
     return report.findings[0]
 
 
-def assert_mended(folder: Path, finding: Finding) -> None:
-    """The option that was named makes the check find nothing any more."""
-    name, value = finding.option.removeprefix("--").split()
-    mended = check_recording(open_recording(folder, options=read_options(f"{name.replace('-', '_')}={value}")))
+def assert_mended(folder: Path, *findings: Finding) -> None:
+    """The options that were named make the check find nothing any more."""
+    pairs = [finding.option.removeprefix("--").split() for finding in findings]
+    said = dict(pair for pair in pairs if pair[0] != "camera")
+    camera = next((parse_camera(value) for name, value in pairs if name == "camera"), None)
+    options = read_options("&".join(f"{name.replace('-', '_')}={value}" for name, value in said.items()))
+    mended = check_recording(open_recording(folder, camera, options))
     assert mended.findings == ()
     assert mended.error_px < 5
 
@@ -112,29 +115,80 @@ def test_poses_in_millimetres(room: Path, tmp_path: Path) -> None:
     assert_mended(folder, finding)
 
 
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """At 30 Hz: poses and depth of 0.1 to 0.3 s before are others."""
+    folder = tmp_path_factory.mktemp("video") / "room"
+    write_synthetic_recording(folder, SyntheticOptions(frames=60, width=160, height=120, lap_frames=240))
+    return folder
+
+
+def with_clocks(source: Path, target: Path, poses_s: float = 0.0, depth_s: float = 0.0) -> Path:
+    """A copy whose clocks of poses and depth are ahead of colour's."""
+    shutil.copytree(source, target, ignore=shutil.ignore_patterns("masks"))
+    for name, later in (("groundtruth.txt", poses_s), ("depth.txt", depth_s)):
+        rows = [line.split(" ", 1) for line in (target / name).read_text().splitlines() if not line.startswith("#")]
+        (target / name).write_text("".join(f"{float(time) + later:.6f} {rest}\n" for time, rest in rows))
+    return target
+
+
 @pytest.mark.parametrize("later", [0.3, -0.2])
-def test_a_clock_that_is_off(room: Path, tmp_path: Path, later: float) -> None:
-    """At 30 Hz: the poses of 0.2 to 0.3 s before are others."""
-    rendered = tmp_path / "rendered"
-    write_synthetic_recording(rendered, SyntheticOptions(frames=60, width=160, height=120, lap_frames=240))
-    folder = with_poses(rendered, tmp_path / "off", lambda pose: pose, later_s=later)
+def test_a_clock_of_poses_that_is_off(video: Path, tmp_path: Path, later: float) -> None:
+    folder = with_clocks(video, tmp_path / "off", poses_s=later)
     finding = the_finding(open_recording(folder), "time_offset")
-    assert float(finding.value) == pytest.approx(-1000 * later, abs=20)
+    assert finding.certain
+    assert float(finding.value) == pytest.approx(-1000 * later, abs=10)
     assert_mended(folder, finding)
 
 
+@pytest.mark.parametrize("later", [0.1, 0.3, -0.2])
+def test_a_clock_of_depth_that_is_off(video: Path, tmp_path: Path, later: float) -> None:
+    folder = with_clocks(video, tmp_path / "off", depth_s=later)
+    finding = the_finding(open_recording(folder), "depth_time_offset")
+    assert not finding.certain
+    assert float(finding.value) == pytest.approx(-1000 * later, abs=10)
+    assert_mended(folder, finding)
+
+
+def test_times_of_colour_and_depth_that_are_interchanged(video: Path, tmp_path: Path) -> None:
+    """Depth was taken 0.1 s before colour; each got the times of the other."""
+    folder = with_clocks(video, tmp_path / "off", poses_s=-0.1, depth_s=-0.2)  # about the clock of colour
+    findings = check_recording(open_recording(folder)).findings
+    assert [(f.kind, f.certain) for f in findings] == [("time_offset", True), ("depth_time_offset", False)]
+    assert [float(f.value) for f in findings] == pytest.approx([100, 200], abs=15)
+    assert_mended(folder, *findings)
+
+
+def test_poses_that_run_backwards(video: Path, tmp_path: Path) -> None:
+    folder = with_clocks(video, tmp_path / "back")
+    rows = [line.split(" ", 1) for line in (folder / "groundtruth.txt").read_text().splitlines()]
+    turned = [f"{time} {rest}\n" for (time, _), (_, rest) in zip(rows, reversed(rows), strict=True)]
+    (folder / "groundtruth.txt").write_text("".join(turned))
+    finding = the_finding(open_recording(folder), "times")
+    assert (finding.certain, finding.option) == (True, "--times reversed")
+    assert_mended(folder, finding)
+
+
+def test_a_turned_world_hides_nothing(room: Path, tmp_path: Path) -> None:
+    folder = with_poses(room, tmp_path / "walk", invert_pose)
+    wrong = check_recording(open_recording(folder, options=ReadOptions(up="0,-1,0.2")))
+    assert [finding.option for finding in wrong.findings] == ["--poses-are camera_from_world"]
+    right = check_recording(open_recording(room, options=ReadOptions(up="0,-1,0.2")))
+    assert right.findings == ()
+
+
 @pytest.mark.parametrize("factor", [0.5, 2.0])
-def test_a_wrong_focal_length(room: Path, factor: float) -> None:
-    recording = open_recording(room)
-    camera = recording.camera
-    recording.camera = type(camera)(
-        camera.width, camera.height, camera.fx * factor, camera.fy * factor, camera.cx, camera.cy
-    )
-    finding = the_finding(recording, "focal")
+def test_a_wrong_focal_length(room: Path, tmp_path: Path, factor: float) -> None:
+    folder = shutil.copytree(room, tmp_path / "room", ignore=shutil.ignore_patterns("masks"))
+    content = json.loads((folder / "camera.json").read_text())
+    right = content["fx"]
+    content |= {"fx": factor * right, "fy": factor * content["fy"]}
+    (folder / "camera.json").write_text(json.dumps(content))
+    finding = the_finding(open_recording(folder), "focal")
+    assert finding.certain
     assert float(finding.value) == pytest.approx(1 / factor, rel=0.03)
-    assert finding.option.startswith("--camera ")
-    fx = float(finding.option.removeprefix("--camera ").split(",")[0])
-    assert fx == pytest.approx(camera.fx, rel=0.03)
+    assert float(finding.option.removeprefix("--camera ").split(",")[0]) == pytest.approx(right, rel=0.03)
+    assert_mended(folder, finding)
 
 
 def test_depth_of_another_place(room: Path, tmp_path: Path) -> None:

@@ -96,6 +96,29 @@ def test_points_that_are_missing_are_found(store: Store, views: tuple[list[Keyfr
     assert with_points.inliers > 1.2 * without.inliers
 
 
+def test_a_map_without_any_depth_is_refined_more_carefully(store: Store) -> None:
+    scene = Scene(2, 250)
+    made = [described(scene, frame, 1.0) for frame in range(FRAMES)]
+    info, _ = ingest(
+        store,
+        "blind",
+        [replace(record(n, view), world_from_camera=pose_of(n)) for n, (view, _) in enumerate(made)],
+        range(FRAMES),
+    )
+    refine_map(store, info, kinds=[POINTS])
+    errors = []
+    for listed, (_, truth) in zip(store.listed_keyframes(info.id), made, strict=True):
+        found = store.refined_points([listed.id])[listed.id]
+        known = np.isfinite(found[:, 2])
+        errors += np.linalg.norm(found[known, :3] - truth.points[known], axis=1).tolist()
+    assert len(errors) > 200
+    assert np.median(errors) < 0.02
+    answer = make_localizer(store, info, "sql").localize(described(scene, 2.5, 1.0)[0])
+    assert answer.verdict == "localized"
+    assert answer.world_from_camera is not None
+    assert np.linalg.norm(answer.world_from_camera[:3, 3] - pose_of(2.5)[:3, 3]) < 0.02
+
+
 def test_order_of_ingest_and_server_do_not_matter(
     store: Store, views: tuple[list[KeyframeRecord], ...], tmp_path: Path
 ) -> None:

@@ -253,6 +253,32 @@ def test_a_scene_gets_missing_points_and_better_ones(block: int) -> None:
     assert np.sqrt(np.mean(np.square(after))) < 0.8 * np.sqrt(np.mean(np.square(before)))
 
 
+def test_without_any_depth_a_point_needs_three_keyframes() -> None:
+    """Wrong matches along a line between two keyframes are told by nothing else: they moved poses by 18 cm."""
+    scene, numbers = Scene(5), ClassNumbers()
+    poses = walk(scene, 4)
+    keypoints = [scene.keypoints(pose) for pose in poses]
+    hidden = [without_depth(found, np.ones(len(found), np.bool_)) for found in keypoints]
+    views = [make_view(CAMERA, found, scene.categories, numbers) for found in hidden]
+    volumes = [
+        volume_of(CAMERA, pose, view.seen_xy, found.points)
+        for pose, view, found in zip(poses, views, keypoints, strict=True)
+    ]
+    two, three = (FusionOptions(), FusionOptions().without_depth(4))
+    assert (three.depths.least_agreeing, three.registration.pose_m, three.registration.pose_rad) == (2, 0.01, 0.003)
+    assert FusionOptions().without_depth(2).depths.least_agreeing == 1
+    with_two, with_three = (dict(refine_points(volumes, views.__getitem__, options)) for options in (two, three))
+    assert sum(len(found.keypoints) for found in with_three.values()) > 200
+    for number, found in with_three.items():
+        assert set(found.keypoints) <= set(with_two[number].keypoints)
+        truth = keypoints[number].points[found.keypoints]
+        off = np.linalg.norm(found.points[:, :3] - truth, axis=1) / truth[:, 2]
+        assert np.median(off) < 0.02
+        assert np.percentile(off, 95) < 0.1
+    pair = dict(refine_points(volumes[:2], views[:2].__getitem__, three))
+    assert pair == {}
+
+
 def test_neighbours_are_those_that_see_the_same() -> None:
     points = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 3], (100, 3)).astype(np.float32)
     pixels = np.full((100, 2), 300, np.float32)

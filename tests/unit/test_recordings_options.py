@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semdb.errors import RecordingError, UsageError
-from semdb.geometry import invert_pose, pose_error, pose_from, rotation_from_quat_wxyz
+from semdb.geometry import invert_pose, pose_error, pose_from, rotation_from_quat_wxyz, so3_exp
 from semdb.recordings import ReadOptions, open_recording
 from semdb.recordings.options import AXES, read_options, write_options
 from tests.unit.recording_miniatures import SMALL, pose, pose_text, write_icl, write_seven_scenes, write_tum
@@ -63,6 +64,37 @@ def test_quaternions_in_the_other_order_and_another_clock(tmp_path: Path) -> Non
         turned.append(" ".join((x, y, z, qw, qx, qy, qz)))
     write_poses(folder, turned, shift_s=0.25)
     assert_right(poses_of(folder, ReadOptions(quaternion="wxyz", time_offset_ms=-250)))
+
+
+def test_poses_that_run_backwards(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "walk")
+    write_poses(folder, [pose_text(pose(5 - i)) for i in range(6)])
+    assert_right(poses_of(folder, ReadOptions(times="reversed")))
+
+
+@pytest.mark.parametrize("up", ["0,0,1", "0,0,-2", "0,-1,0", "0.3,-0.5,0.1"])
+@pytest.mark.parametrize("write", [write_tum, write_icl, write_seven_scenes])
+def test_up_becomes_z(tmp_path: Path, up: str, write: Callable[[Path], Path]) -> None:
+    folder = write(tmp_path / "seq-01")
+    camera = None if write is write_seven_scenes else SMALL
+    plain = open_recording(folder, camera)
+    turned = open_recording(folder, camera, ReadOptions(up=up))
+    direction = np.array([float(value) for value in up.split(",")])
+    assert turned.world_turn is not None
+    np.testing.assert_allclose(turned.world_turn[:3, :3] @ direction / np.linalg.norm(direction), [0, 0, 1], atol=1e-12)
+    assert np.linalg.det(turned.world_turn[:3, :3]) == pytest.approx(1)
+    for one, other in zip(plain.entries, turned.entries, strict=True):
+        assert one.world_from_camera is not None
+        np.testing.assert_allclose(turned.world_turn @ one.world_from_camera, other.world_from_camera, atol=1e-12)
+
+
+def test_up_is_where_the_cameras_have_it(tmp_path: Path) -> None:
+    """Upright cameras that look around: their y axis points down."""
+    folder = write_tum(tmp_path / "walk")
+    write_poses(folder, [pose_text(pose_from(so3_exp([0, 0.4 * i, 0]), [0.1 * i, 0, 0])) for i in range(6)])
+    found = poses_of(folder, ReadOptions(up="cameras"))
+    for one in found:
+        np.testing.assert_allclose(one[:3, 1], [0, 0, -1], atol=1e-9)
 
 
 def test_depth_of_another_scale_and_clock(tmp_path: Path) -> None:
@@ -118,6 +150,9 @@ def test_an_option_that_means_nothing_to_the_format_is_refused(tmp_path: Path) -
         ({"poses_are": "inverted"}, "--poses-are inverted: known are world_from_camera, camera_from_world"),
         ({"axes": "unity"}, "--axes unity: known are opencv, opengl, arkit, ros"),
         ({"quaternion": "zyxw"}, "--quaternion zyxw"),
+        ({"times": "sideways"}, "--times sideways: known are reversed"),
+        ({"up": "down"}, "--up takes x,y,z or cameras, but is 'down'"),
+        ({"up": "0,0,0"}, "--up 0,0,0: no direction is up in it"),
         ({"time_offset_ms": float("inf")}, "--time-offset-ms must be a number of milliseconds"),
     ],
 )

@@ -42,6 +42,19 @@ def shifted_errors(pairs: Sequence[Pair], poses: FloatArray, times_ns: Int64Arra
     return None if not np.isfinite(tried(best)) else (best, known[best])
 
 
+def reversed_errors(pairs: Sequence[Pair], poses: FloatArray, times_ns: Int64Array) -> FloatArray:
+    """The errors ``[pairs]`` if the poses ran backwards through the times; NaN where none is near."""
+    quats = np.stack([quat_wxyz_from_rotation(pose[:3, :3]) for pose in poses])
+    mirrored = int(times_ns[0]) + int(times_ns[-1])
+    moved, found = poses.copy(), np.full(len(pairs), np.nan)
+    for number, pair in enumerate(pairs):
+        ends = [poses_at(poses, quats, times_ns, mirrored - int(times_ns[i])) for i in (pair.first, pair.second)]
+        if ends[0] is not None and ends[1] is not None:
+            moved[pair.first], moved[pair.second] = ends[0], ends[1]
+            found[number] = errors([pair], moved)[0]
+    return found
+
+
 def _errors_at(
     pairs: Sequence[Pair], poses: FloatArray, quats: FloatArray, times_ns: Int64Array, shift_s: float
 ) -> FloatArray:

@@ -31,12 +31,12 @@ def edge_frame(image: ImageArray, depth: Float32Array) -> EdgeFrame:
     level = float(np.median(grey))
     edges = cv2.Canny(grey, 0.4 * level, 0.9 * level)
     distance = np.minimum(cv2.distanceTransform(np.where(edges > 0, 0, 255).astype(np.uint8), cv2.DIST_L2, 3), CAP)
-    small = cv2.resize(depth, SIZE, interpolation=cv2.INTER_NEAREST)
-    return EdgeFrame(_depth_edges(small), np.asarray(distance, np.float32))
+    return EdgeFrame(depth_edges(depth), np.asarray(distance, np.float32))
 
 
-def _depth_edges(depth: Float32Array) -> FloatArray:
-    """Pixels of the nearer side of depth steps between known neighbours, about the image's centre."""
+def depth_edges(depth: Float32Array) -> FloatArray:
+    """Pixels ``[n, 2]`` (of `SIZE`, about its centre) of depth steps between known neighbours of ``[H, W]`` metres."""
+    depth = np.asarray(cv2.resize(depth, SIZE, interpolation=cv2.INTER_NEAREST), np.float32)
     mask = np.zeros(depth.shape, bool)
     with np.errstate(invalid="ignore"):
         for axis in (0, 1):

@@ -12,12 +12,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from semdb.recordings.check.clocks import shifted_errors
+from semdb.recordings.check.clocks import reversed_errors, shifted_errors
 from semdb.recordings.check.edges import EdgeFrame
 from semdb.recordings.check.motion import Change, errors, free_motion, translation_ratios
 from semdb.recordings.check.pairs import Pair
 from semdb.recordings.check.readings import AS_USUAL, Reading, readings, reread
-from semdb.recordings.check.registration import Misplaced, misplaced
+from semdb.recordings.check.registration import DepthEdgesAt, Misplaced, misplaced
 from semdb.recordings.options import option_of
 from semdb.recordings.own_depth import resized
 from semdb.shown import number
@@ -44,9 +44,9 @@ SPREADS, WIDEST_SPREAD = 3.0, 0.45  # of their logarithms
 class Finding:
     """Something that the images contradict.
 
-    `kind` is ``poses_are``, ``axes``, ``quaternion``, ``depth_scale``, ``scale``, ``focal``, ``time_offset``,
-    ``depth_time_offset`` or ``depth_registration``. `value` is what fits, `option` what mends it ("" where nothing
-    does). What is not `certain` is likely.
+    `kind` is ``poses_are``, ``axes``, ``quaternion``, ``depth_scale``, ``scale``, ``focal``, ``times``,
+    ``time_offset``, ``depth_time_offset`` or ``depth_registration``. `value` is what fits, `option` what mends it
+    ("" where nothing does). What is not `certain` is likely.
     """
 
     kind: str
@@ -65,6 +65,7 @@ class Observed:
     times_ns: Int64Array | None = None
     steps_s: FloatArray = field(default_factory=lambda: np.empty(0))  # between the frames of each pair
     edges: Mapping[int, EdgeFrame] = field(default_factory=dict)  # by frame
+    depth_edges_at: DepthEdgesAt | None = None
     current: Reading = AS_USUAL
     takes: frozenset[str] = frozenset()
     camera: Camera | None = None
@@ -110,7 +111,7 @@ def find(observed: Observed) -> tuple[list[Finding], float, float, list[str]]:
             found += _judge(observed, as_read, _best(observed, as_read), floor, depth)
         if not found:
             found += _turning(observed, floor, depth)
-    if not found:
+    if all(finding.kind == "time_offset" for finding in found):  # what is of depth alone does not depend on poses
         found += _depth_findings(observed)
     return found, error, floor, notes
 
@@ -174,6 +175,8 @@ def _time_offset(observed: Observed) -> Iterator[_Explanation]:
     found = shifted_errors(observed.pairs, observed.poses, observed.times_ns)
     if found is not None and abs(found[0]) >= LEAST_OFFSET_S:
         yield _Explanation({"time_offset_s": found[0]}, found[1])
+    if "times" in observed.takes:
+        yield _Explanation({"times": "reversed"}, reversed_errors(observed.pairs, observed.poses, observed.times_ns))
 
 
 def _turning(observed: Observed, floor: float, median_depth: float) -> list[Finding]:
@@ -227,6 +230,8 @@ def _finding(
     if name in ("poses_are", "axes", "quaternion"):
         what = {"poses_are": "the poses are", "axes": "the poses are of axes", "quaternion": "quaternions are"}[name]
         yield Finding(name, certain, value, f"{option_of(name)} {value}", f"{what} {value}: {text}")
+    elif name == "times":
+        yield Finding("times", certain, value, f"--times {value}", f"the poses run backwards through the times: {text}")
     elif name == "depth_factor":
         yield _scale_finding(observed, float(value), certain, text, median_depth)
     elif name == "focal_factor":
@@ -278,11 +283,11 @@ def _camera_option(camera: Camera, factor: float) -> str:
 
 def _depth_findings(observed: Observed) -> Iterator[Finding]:
     """Depth that does not lie where colour does, or is of another time."""
-    place: Misplaced | None = misplaced(observed.pairs, observed.edges, observed.steps_s)
+    place: Misplaced | None = misplaced(observed.pairs, observed.edges, observed.steps_s, observed.depth_edges_at)
     if place is None:
         return
     if place.delay_s:
-        offset = round(observed.depth_offset_ms - place.delay_s * 1000)
+        offset = round(observed.depth_offset_ms + place.delay_s * 1000)
         text = (
             f"depth is of {abs(place.delay_s) * 1000:.0f} ms {'later' if place.delay_s > 0 else 'earlier'} than colour"
         )

@@ -66,18 +66,22 @@ def free_motion(pair: Pair) -> tuple[FloatArray, float] | None:
     xy, depth = pair.xy_first[known], pair.depth_first[known]
     points = np.column_stack([xy * depth[:, None], depth])
     seen = pair.xy_second[known]
-    done, turn, shift, inliers = cv2.solvePnPRansac(
-        points, seen, np.eye(3), None, reprojectionError=4.0 / pair.focal, iterationsCount=300, flags=cv2.SOLVEPNP_EPNP
-    )
-    if not done or inliers is None or len(inliers) < MIN_MATCHES // 2:
+    unit, off = np.eye(3), 4.0 / pair.focal
+    try:
+        done, turn, shift, inliers = cv2.solvePnPRansac(
+            points, seen, unit, None, reprojectionError=off, iterationsCount=300, flags=cv2.SOLVEPNP_EPNP
+        )
+        if not done or inliers is None or len(inliers) < MIN_MATCHES // 2:
+            return None
+        chosen = inliers.ravel()
+        turn, shift = cv2.solvePnPRefineLM(points[chosen], seen[chosen], unit, None, turn, shift)
+    except cv2.error:  # degenerate points
         return None
-    chosen = inliers.ravel()
-    turn, shift = cv2.solvePnPRefineLM(points[chosen], seen[chosen], np.eye(3), None, turn, shift)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
     moved = points @ pose[:3, :3].T + pose[:3, 3]
-    off = (moved[:, :2] / moved[:, 2:] - seen) * pair.focal
-    return pose, float(np.median(np.hypot(off[:, 0], off[:, 1])))
+    error = (moved[:, :2] / moved[:, 2:] - seen) * pair.focal
+    return pose, float(np.median(np.hypot(error[:, 0], error[:, 1])))
 
 
 def translation_ratios(pairs: Sequence[Pair], poses: FloatArray) -> FloatArray:

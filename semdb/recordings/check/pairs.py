@@ -87,9 +87,12 @@ def match(first: View, second: View) -> Pair | None:
     if len(i) < MIN_MATCHES:
         return None
     scale = WIDTH / first.camera.width
-    _, mask = cv2.findFundamentalMat(
-        first.xy[i] * scale, second.xy[j] * scale, cv2.USAC_MAGSAC, EPIPOLAR_PX, 0.999, 2000
-    )
+    try:
+        _, mask = cv2.findFundamentalMat(
+            first.xy[i] * scale, second.xy[j] * scale, cv2.USAC_MAGSAC, EPIPOLAR_PX, 0.999, 2000
+        )
+    except cv2.error:  # OpenCV 5.0 asserts where it finds no model
+        return None
     if mask is None or int(mask.sum()) < MIN_MATCHES:
         return None
     kept = mask.ravel() > 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +19,12 @@ LEAST_ZOOM, LEAST_SHIFT = 0.05, 7.0  # what is less is calibration
 DELAYS_S = np.arange(-0.3, 0.301, 0.01)
 LEAST_DELAY_S = 0.04
 DELAY_BETTER = 0.88
+WINDOW_S = 0.1  # about a delay by the flow in which depth images themselves are tried
+FINE_STEP_S = 0.05  # at most between depth images for that
+GRID_S = np.arange(-0.075, 0.076, 0.005)
+
+DepthEdgesAt = Callable[[int, float], tuple[float, FloatArray] | None]
+"""Edges ``[n, 2]`` of the depth image nearest to a time in seconds after that of a frame, and how much later it is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,8 +36,16 @@ class Misplaced:
     delay_s: float = 0.0  # positive: depth is later than colour
 
 
-def misplaced(pairs: Sequence[Pair], edges: Mapping[int, EdgeFrame], steps_s: FloatArray) -> Misplaced | None:
-    """What would make depth fit colour far better; None where nothing does, or there is too little to tell."""
+def misplaced(
+    pairs: Sequence[Pair],
+    edges: Mapping[int, EdgeFrame],
+    steps_s: FloatArray,
+    depth_edges_at: DepthEdgesAt | None = None,
+) -> Misplaced | None:
+    """What would make depth fit colour far better; None where nothing does, or there is too little to tell.
+
+    A delay is found by the flow of the images; with `depth_edges_at` depth images around it then say it finer.
+    """
     frames = [edges[pair.first] for pair in pairs if pair.first in edges]
     if len(frames) < LEAST_FRAMES or sum(len(frame.points) for frame in frames) < LEAST_POINTS:
         return None
@@ -39,7 +53,8 @@ def misplaced(pairs: Sequence[Pair], edges: Mapping[int, EdgeFrame], steps_s: Fl
     as_is = misfit(frames, 1.0, nothing)
     late = _delay(pairs, edges, steps_s)
     if late is not None and late[1] < DELAY_BETTER * as_is:
-        return Misplaced(delay_s=late[0])
+        fine = None if depth_edges_at is None else _fine_delay(pairs, edges, late[0], depth_edges_at)
+        return Misplaced(delay_s=late[0] if fine is None else fine)
     zoom, shift, least = _place(frames)
     far = abs(zoom - 1) >= LEAST_ZOOM or float(np.hypot(*shift)) >= LEAST_SHIFT
     if not far or least > BETTER * as_is:
@@ -76,3 +91,25 @@ def _delay(pairs: Sequence[Pair], edges: Mapping[int, EdgeFrame], steps_s: Float
     scores = [misfit(frames, 1.0, -speed * delay) for delay in DELAYS_S]
     least = int(np.argmin(scores))
     return None if abs(DELAYS_S[least]) < LEAST_DELAY_S else (float(DELAYS_S[least]), float(scores[least]))
+
+
+def _fine_delay(
+    pairs: Sequence[Pair], edges: Mapping[int, EdgeFrame], rough_s: float, depth_edges_at: DepthEdgesAt
+) -> float | None:
+    """The delay near `rough_s` at which depth images of other times lie on colour; None where they are too sparse.
+
+    An image that is late shows what an earlier neighbour should, so neighbours are looked at on the other side.
+    """
+    steps = np.arange(-WINDOW_S, WINDOW_S + 1e-9, FINE_STEP_S / 2)
+    curves = []
+    for index in [pair.first for pair in pairs if pair.first in edges]:
+        near = dict(found for step in steps if (found := depth_edges_at(index, step - rough_s)) is not None)
+        later = np.array(sorted(near))
+        if len(later) < 3 or float(np.diff(later).max()) > FINE_STEP_S:
+            continue
+        scores = [misfit([EdgeFrame(near[t], edges[index].distance)], 1.0, np.zeros((1, 2))) for t in later.tolist()]
+        curves.append(np.interp(GRID_S - rough_s, later, scores, left=np.nan, right=np.nan))
+    whole = [curve for curve in curves if np.isfinite(curve).all()]
+    if len(whole) < LEAST_FRAMES:
+        return None
+    return float(rough_s - GRID_S[int(np.argmin(np.mean(whole, axis=0)))])

@@ -8,17 +8,19 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from semdb.errors import FrameError
+from semdb.geometry import invert_pose
 from semdb.recordings.base import FrameEntry, Recording
-from semdb.recordings.check.edges import EdgeFrame, edge_frame
+from semdb.recordings.check.edges import EdgeFrame, depth_edges, edge_frame
 from semdb.recordings.check.findings import Finding, Observed, find
 from semdb.recordings.check.pairs import Pair, View, look, match
 from semdb.recordings.check.readings import Reading
-from semdb.types import Int64Array
+from semdb.types import FloatArray, Int64Array
 
 PAIRS = 12  # that are looked for
 LEAST_FLOW, MOST_FLOW = 25.0, 130.0  # pixels of an image of 640: enough to tell, little enough to match
 START_NS = 330_000_000  # between the frames of the first try
 FARTHEST_NS = 2_000_000_000
+NEAR_S = 0.02
 TRIES = 4
 ARKIT_FORMATS = ("record3d", "polycam")  # whose poses are in these axes unless somebody says otherwise
 
@@ -44,6 +46,8 @@ class _Sample:
     entries: Sequence[FrameEntry]
     views: dict[int, View | None] = field(default_factory=dict)
     edges: dict[int, EdgeFrame] = field(default_factory=dict)
+    depth_edges: dict[int, FloatArray | None] = field(default_factory=dict)
+    times_ns: Int64Array | None = None
 
     def view(self, position: int) -> View | None:
         if position not in self.views:
@@ -58,6 +62,26 @@ class _Sample:
                 if depth is not None:
                     self.edges[position] = edge_frame(image, depth)
         return self.views[position]
+
+    def depth_edges_at(self, position: int, later_s: float) -> tuple[float, FloatArray] | None:
+        """Edges of the depth image nearest to `later_s` after a frame, and how much later it is; None beyond 20 ms."""
+        start = self.entries[position].timestamp_ns
+        if start is None:
+            return None
+        if self.times_ns is None:
+            self.times_ns = np.array([entry.timestamp_ns or 0 for entry in self.entries], dtype=np.int64)
+        nearest = int(np.argmin(np.abs(self.times_ns - start - round(later_s * 1e9))))
+        later = (int(self.times_ns[nearest]) - start) * 1e-9
+        if abs(later - later_s) > NEAR_S:
+            return None
+        if nearest not in self.depth_edges:
+            try:
+                depth = self.recording.read_depth(self.entries[nearest])
+            except FrameError:
+                depth = None
+            self.depth_edges[nearest] = None if depth is None else depth_edges(depth)
+        found = self.depth_edges[nearest]
+        return None if found is None else (later, found)
 
 
 def check_recording(recording: Recording, *, progress: Progress | None = None) -> Report:
@@ -75,6 +99,9 @@ def check_recording(recording: Recording, *, progress: Progress | None = None) -
         if progress is not None:
             progress(done, PAIRS)
     posed = [entry.world_from_camera for entry in entries]
+    if recording.world_turn is not None:  # how poses are written shows before
+        back = invert_pose(recording.world_turn)
+        posed = [None if pose is None else back @ pose for pose in posed]
     reading = recording.reading
     axes = reading.axes or ("arkit" if recording.format in ARKIT_FORMATS else "opencv")
     observed = Observed(
@@ -83,6 +110,7 @@ def check_recording(recording: Recording, *, progress: Progress | None = None) -
         times_ns=_times(entries),
         steps_s=np.array(steps),
         edges={pair.first: sample.edges[pair.first] for pair in pairs if pair.first in sample.edges},
+        depth_edges_at=sample.depth_edges_at,
         current=Reading(reading.poses_are, axes, reading.quaternion or "xyzw"),
         takes=recording.takes,
         camera=recording.camera,

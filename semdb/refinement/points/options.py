@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,13 +39,27 @@ class RegistrationOptions:
 class DepthOptions:
     """`fuse` improves measured depths too; without it only missing ones are found.
 
-    A triangulated depth needs a relative standard deviation of at most `most_relative`; where no keyframe measured the
-    point, rays at least `least_parallax_deg` apart besides.
+    A depth needs `least_agreeing` other keyframes. A triangulated one needs a relative standard deviation of at most
+    `most_relative`; where no keyframe measured the point, rays at least `least_parallax_deg` apart besides.
     """
 
     fuse: bool = True
     most_relative: float = 0.05
     least_parallax_deg: float = 1.5
+    least_agreeing: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class BlindOptions:
+    """What is different where no keyframe of a map has any depth, as in a model of COLMAP.
+
+    Nothing tells a wrong match along an epipolar line then but a third keyframe, and nothing but these lines tells how
+    far the poses are off: fewer metres and radians (one sigma) are believed.
+    """
+
+    least_agreeing: int = 2
+    pose_m: float = 0.01
+    pose_rad: float = 0.003
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,3 +77,10 @@ class FusionOptions:
     gate: GateOptions = field(default_factory=GateOptions)
     registration: RegistrationOptions = field(default_factory=RegistrationOptions)
     depths: DepthOptions = field(default_factory=DepthOptions)
+    blind: BlindOptions = field(default_factory=BlindOptions)
+
+    def without_depth(self, keyframes: int) -> FusionOptions:
+        """The options for a map of so many `keyframes` none of which has depth; two cannot be asked for a third."""
+        registration = replace(self.registration, pose_m=self.blind.pose_m, pose_rad=self.blind.pose_rad)
+        agreeing = self.blind.least_agreeing if keyframes > 2 else self.depths.least_agreeing
+        return replace(self, registration=registration, depths=replace(self.depths, least_agreeing=agreeing))

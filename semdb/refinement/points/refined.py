@@ -155,7 +155,7 @@ def _solve(
     focals = [views.of(number).focal for number in nodes.frames]
     observations, keypoints = _observations(core, nodes, pairs, poses, laid, focals, options)
     found = solve_depths(observations, options.depths)
-    good = np.isfinite(found.depth)
+    good = np.isfinite(found.depth) & (found.agreeing >= options.depths.least_agreeing)
     keypoints, depth, sigma = keypoints[good], found.depth[good], found.sigma[good]
     bounds = np.searchsorted(keypoints, nodes.start)
     for at, number in enumerate(nodes.frames):
