@@ -2,8 +2,9 @@
 
 ``python -m bench.trajectory RECORDING... [--every N] [--refined DIR] [--json FILE]``. Absolute trajectory error after
 rigid alignment (RMSE and median) and relative pose error over a second, of all frames with a pose; milliseconds per
-frame, decoding included for semdb and left out for the peers, and as many times as SURF alone takes. Closures are
-checked against the truth, and wrong ones are injected.
+frame, decoding included for semdb and left out for the peers; and processor time, of all threads, as many times as SURF
+alone takes, which other work on the machine changes little. Closures are checked against the truth, and wrong ones are
+injected.
 
 The truth is what the recording says; ``--refined DIR`` compares with poses that pycolmap refined (some minutes for each
 recording; kept in DIR and found again there). Open3D is measured where it is installed (``semdb[bench]``).
@@ -55,8 +56,9 @@ def main() -> None:
 
 def measure(recording: Recording, every: int, refined: Path | None, *, peers: bool) -> dict[str, Any]:
     """All methods on one recording."""
-    started = time.perf_counter()
+    started, began = time.perf_counter(), time.process_time()
     found = find_recorded(recording, every=every)
+    cpu = (time.process_time() - began) / len(found.entries)
     spent = (time.perf_counter() - started) / len(found.entries)
     entries, (times_s, _) = found.entries, times_of(found.entries)
     true, known = truth_of(recording, entries, times_s, refined)
@@ -64,15 +66,14 @@ def measure(recording: Recording, every: int, refined: Path | None, *, peers: bo
     trajectory = found.trajectory
     ours = [frame.world_from_camera if frame.piece == 0 else None for frame in trajectory.frames]
     before = [frame.before_closing if frame.piece == 0 else None for frame in trajectory.frames]
-    tracking = trajectory.timing_s["tracking"] / len(entries)
     rows = {
-        "semdb": row(ours, true, known, times_s, spent, surf),
-        "semdb, odometry alone": row(before, true, known, times_s, tracking, surf),
+        "semdb": row(ours, true, known, times_s, (spent, cpu), surf),
+        "semdb, odometry alone": row(before, true, known, times_s, None, surf),
     }
     steps: dict[str, Step | None] = {"opencv": opencv_step(), "open3d": open3d_step()} if peers else {}
     for name, step in steps.items():
         if step is not None:
-            poses, seconds = track(recording, entries, step)
+            poses, *seconds = track(recording, entries, step)
             rows[name] = row(poses, true, known, times_s, seconds, surf)
     return {
         "recording": recording.name,
@@ -90,17 +91,18 @@ def row(
     true: FloatArray,
     known: np.ndarray,
     times_s: FloatArray,
-    seconds: float,
+    seconds: Sequence[float] | None,
     surf: float,
 ) -> dict[str, Any]:
-    """Figures of one method."""
+    """Figures of one method, which took `seconds` of wall and of processor time for a frame."""
     rows = [n for n, pose in enumerate(poses) if pose is not None and known[n]]
+    time_spent = {} if seconds is None else {"ms": 1000 * seconds[0], "times_surf": seconds[1] / surf}
     if len(rows) < 3:
-        return {"placed": len(rows), "ms": 1000 * seconds, "times_surf": seconds / surf}
+        return {"placed": len(rows), **time_spent}
     estimated = np.stack([pose for n in rows if (pose := poses[n]) is not None])
     errors = trajectory_errors(estimated, true[rows], times_s[rows])
     placed = sum(pose is not None for pose in poses)
-    return {"placed": placed, **asdict(errors), "ms": 1000 * seconds, "times_surf": seconds / surf}
+    return {"placed": placed, **asdict(errors), **time_spent}
 
 
 def truth_of(
@@ -133,15 +135,15 @@ def truth_of(
 
 
 def surf_seconds(recording: Recording, entries: Sequence[FrameEntry]) -> float:
-    """Seconds that SURF alone takes for an image, as tracking uses it."""
+    """Seconds of processor time that SURF alone takes for an image, as tracking uses it."""
     features = SurfFeatures(max_keypoints=TrajectoryOptions().max_keypoints)
     chosen = [entries[n] for n in np.unique(np.linspace(0, len(entries) - 1, SURF_FRAMES).astype(int))]
     greys = [np.asarray(cv2.cvtColor(recording.read_image(e), cv2.COLOR_RGB2GRAY), np.uint8) for e in chosen]
     features.extract(greys[0])
-    started = time.perf_counter()
+    began = time.process_time()
     for grey in greys:
         features.extract(grey)
-    return (time.perf_counter() - started) / len(greys)
+    return (time.process_time() - began) / len(greys)
 
 
 def show(result: dict[str, Any]) -> None:
@@ -154,9 +156,10 @@ def show(result: dict[str, Any]) -> None:
             continue
         relative = [figures["relative_rmse_m"], figures["relative_rmse_deg"]]
         texts = ["-" if value is None else f"{value:.4f}" for value in relative]
+        spent = f"{figures['ms']:8.1f}{figures['times_surf']:8.1f}" if "ms" in figures else ""
         print(
             f"{name:24}{figures['placed']:8d}{figures['rmse_m']:10.4f}{figures['median_m']:10.4f}"
-            f"{texts[0]:>10}{texts[1][:6]:>8}{figures['ms']:8.1f}{figures['times_surf']:8.1f}"
+            f"{texts[0]:>10}{texts[1][:6]:>8}{spent}"
         )
     closures = result["closures"]
     if closures is not None:

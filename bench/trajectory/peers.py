@@ -39,24 +39,29 @@ def undistorted(camera: Camera, image: ImageArray, depth: Float32Array) -> tuple
     return np.asarray(seen, np.uint8), np.asarray(cv2.remap(filled, *maps, cv2.INTER_NEAREST), np.float32)
 
 
-def track(recording: Recording, entries: Sequence[FrameEntry], step: Step) -> tuple[list[FloatArray | None], float]:
-    """Poses (None where a step failed: the next goes on from there) and seconds per frame, decoding left out."""
+def track(
+    recording: Recording, entries: Sequence[FrameEntry], step: Step
+) -> tuple[list[FloatArray | None], float, float]:
+    """Poses (None where a step failed: the next goes on from there), and seconds per frame of wall and of processor
+    time, decoding left out.
+    """
     poses: list[FloatArray | None] = [np.eye(4)]
-    pose, motion, spent = np.eye(4), np.eye(4), 0.0
+    pose, motion, spent, cpu = np.eye(4), np.eye(4), 0.0, 0.0
     before: tuple[ImageArray, Float32Array] | None = None
     for entry in entries:
         depth = recording.read_depth(entry)
         assert depth is not None
         now = undistorted(recording.camera, recording.read_image(entry), depth)
         if before is not None:
-            started = time.perf_counter()
+            started, began = time.perf_counter(), time.process_time()
             found = step(Pair(recording.camera, before, now), motion)
             spent += time.perf_counter() - started
+            cpu += time.process_time() - began
             motion = np.eye(4) if found is None else found
             pose = pose @ invert_pose(motion)
             poses.append(None if found is None else pose)
         before = now
-    return poses, spent / max(len(entries), 1)
+    return poses, spent / max(len(entries), 1), cpu / max(len(entries), 1)
 
 
 def opencv_step() -> Step:

@@ -11,6 +11,7 @@ from semdb.geometry import back_project, invert_pose, normalized_to_pixels, tran
 from semdb.types import Camera, Float32Array, FloatArray
 
 SAMPLES = 64
+LEAST_DEPTH_M = 0.1  # nearer is not seen
 UNKNOWN_DEPTH_M = 2.0  # where a keyframe without depth is taken to look
 
 
@@ -29,7 +30,7 @@ class Volume:
     def share_of(self, points: FloatArray) -> float:
         """Share of world `points` ``[n, 3]`` that fall into its image."""
         local = transform_points(invert_pose(self.world_from_camera), points)
-        front = local[local[:, 2] > 0.1]
+        front = local[local[:, 2] > LEAST_DEPTH_M]
         xy = normalized_to_pixels(self.camera, front[:, :2] / front[:, 2:])
         inside = (xy > 0).all(axis=1) & (xy < [self.camera.width - 1, self.camera.height - 1]).all(axis=1)
         return float(inside.sum()) / len(points)

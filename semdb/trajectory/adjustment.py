@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import bsr_array
 from scipy.sparse.linalg import splu
 
@@ -20,7 +19,7 @@ from semdb.geometry.sensor import depth_noise
 from semdb.geometry.stacks import invert_poses
 from semdb.localization.bundle import CAUCHY_SQUARED, NORMAL_MEDIAN
 from semdb.localization.bundle_kernels import move_images, move_points, normal_equations
-from semdb.trajectory.adjustment_kernels import mark_shared, reduce_to_blocks
+from semdb.trajectory.adjustment_kernels import mark_shared, reduce_to_blocks, solve_positive
 from semdb.trajectory.options import AdjustmentOptions
 from semdb.types import BoolArray, FloatArray, IntArray
 
@@ -151,8 +150,10 @@ class _Solver:
             whole = np.zeros((self.count, 9, self.count, 9))
             whole[self.one, :, self.two, :] = matrix
             whole[self.two[off], :, self.one[off], :] = np.swapaxes(matrix[off], 1, 2)
-            factor = cho_factor(whole.reshape(size, size), lower=True, overwrite_a=True, check_finite=False)
-            return np.asarray(-cho_solve(factor, gradient.reshape(-1), check_finite=False)).reshape(-1, 9)
+            found = -gradient.reshape(-1)
+            if not solve_positive(whole.reshape(size, size), found):
+                raise np.linalg.LinAlgError("the equations of the images are not positive")
+            return found.reshape(-1, 9)
         rows, columns = np.r_[self.one, self.two[off]], np.r_[self.two, self.one[off]]
         data = np.concatenate([matrix, np.swapaxes(matrix[off], 1, 2)])
         order = np.lexsort((columns, rows))

@@ -33,7 +33,7 @@ def close_loops(
     chain = chain_of(start, pieces, np.array(odometry.steps).reshape(-1, 6, 6))
     refused: dict[tuple[int, int], str] = {}
     for done in range(options.closures.rounds):
-        search.look(search.near(solution.components) if done else search.alike(), progress)
+        search.look(_wanted(search.near(solution.components), edges, options) if done else search.alike(), progress)
         while True:
             closures = _without(consistent(search.edges, chain, options.consistency), pieces, refused)
             edges = [*odometry.edges, *closures]
@@ -46,6 +46,18 @@ def close_loops(
                 break
             refused |= doubts
     return edges, solution
+
+
+def _wanted(
+    pairs: Sequence[tuple[int, int]], edges: Sequence[Edge], options: TrajectoryOptions
+) -> list[tuple[int, int]]:
+    """Those of `pairs` in which a keyframe has not got `enough` closures yet."""
+    counts: dict[int, int] = {}
+    for edge in edges:
+        if edge.kind is not EdgeKind.ODOMETRY and _counts(edge):
+            for end in (edge.first, edge.second):
+                counts[end] = counts.get(end, 0) + 1
+    return [pair for pair in pairs if min(counts.get(end, 0) for end in pair) < options.closures.enough]
 
 
 def _doubtful(

@@ -11,7 +11,7 @@ from semdb.localization.confidence import sigmas
 from semdb.localization.views import KeyframeView
 from semdb.trajectory.depth_views import depth_agreement
 from semdb.trajectory.edges import Edge, EdgeKind, EdgeState
-from semdb.trajectory.keyframes import Keyframes, common_view
+from semdb.trajectory.keyframes import Keyframes, common_view, common_views
 from semdb.trajectory.measuring import joined
 from semdb.trajectory.observations import FrameObservations, observations_of
 from semdb.trajectory.odometry import local_covariance
@@ -77,11 +77,9 @@ class ClosureSearch:
         for number, volume in enumerate(volumes):
             possible = np.flatnonzero(self.apart(number) & (worlds == worlds[number]))
             distance = np.linalg.norm(centres[possible] - centres[number], axis=1)
-            ranked = []
-            for other in possible[np.argsort(distance, kind="stable")[: options.candidates]].tolist():
-                share = common_view(volume, volumes[other])
-                if share >= options.near_view:
-                    ranked.append((-share, other))
+            candidates = possible[np.argsort(distance, kind="stable")[: options.candidates]].tolist()
+            shares = common_views(volume, [volumes[other] for other in candidates]).tolist()
+            ranked = [(-s, n) for s, n in zip(shares, candidates, strict=True) if s >= options.near_view]
             pairs += [_pair(number, other) for other in _spread([n for _, n in sorted(ranked)], options.near)]
         return sorted(set(pairs))
 

@@ -15,7 +15,7 @@ from semdb.perception.protocols import Encoder
 from semdb.trajectory.depth_views import depth_agreement
 from semdb.trajectory.edges import Edge, EdgeKind
 from semdb.trajectory.frames import EmptyFrame, SeenFrame
-from semdb.trajectory.keyframes import Keyframe, Keyframes, common_view, sample_of, with_points_only
+from semdb.trajectory.keyframes import Keyframe, Keyframes, common_views, sample_of, with_points_only
 from semdb.trajectory.motion import Motion, turn_rates
 from semdb.trajectory.observations import FrameObservations, observations_of
 from semdb.trajectory.options import TrajectoryOptions
@@ -218,7 +218,7 @@ class Odometry:
         sample = transform_points(placed.pose, sample_of(frame.view))
         volume = Volume(frame.view.camera, placed.pose, sample)
         near = self.keyframes.nearest(placed.pose, self.keyframes.in_piece(self._piece), COMPARED)
-        common = max((common_view(volume, self.keyframes.volume(n)) for n in near), default=0.0)
+        common = max(common_views(volume, [self.keyframes.volume(n) for n in near]), default=0.0)
         if common < options.urgent_view or placed.estimate.inliers < options.urgent_inliers:
             return True
         if common >= options.common_view:

@@ -74,6 +74,7 @@ class ClosureOptions:
     apart_keyframes: int = 12
     alike: int = 3
     near: int = 3
+    enough: int = 1  # closures of a keyframe: near ones are compared where one of both has fewer
     near_view: float = 0.2  # common view that is expected of near ones
     candidates: int = 32  # whose view is compared, of those that look nearest by
     session_confidence: float = 0.95  # of a closure between pieces, which no odometry confirms

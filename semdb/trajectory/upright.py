@@ -18,7 +18,7 @@ from semdb.types import FloatArray
 
 STRIDE = 3  # cells of a thinned depth between the points that a normal is of
 NORMALS = 400  # of each keyframe
-SEARCHED = 8000  # of all, while directions are tried
+SEARCHED = 3000  # of all, while directions are tried
 BEND = 0.97  # cosine that the normals of neighbouring cells of a plane have at least
 FARTHEST_DEG = 40.0  # of up from the cameras' mean up
 WIDTH_DEG = 3.0  # to which surfaces are level or plumb
@@ -128,12 +128,12 @@ def _support(normals: FloatArray, directions: FloatArray) -> FloatArray:
 
 def _settled(normals: FloatArray, up: FloatArray) -> FloatArray:
     """The direction near `up` that surfaces which are level or plumb to it agree on, least squares with weights."""
-    for _ in range(10):
+    for _ in range(6):
         along = normals @ up
         width = np.sin(np.radians(WIDTH_DEG))
         level = np.exp(-0.5 * np.maximum(1 - along**2, 0) / width**2)
         plumb = np.exp(-0.5 * along**2 / width**2)
-        spread = (normals * (plumb - level)[:, None]).T @ normals
+        spread = np.einsum("ni,n,nj->ij", normals, plumb - level, normals)  # not of BLAS: the same on any threads
         _, vectors = np.linalg.eigh(spread)
         up = vectors[:, 0] * np.sign(vectors[:, 0] @ up)
     return np.asarray(up, np.float64)

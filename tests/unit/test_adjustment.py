@@ -11,6 +11,7 @@ from semdb.geometry import pose_from, so3_exp
 from semdb.geometry.sensor import depth_noise
 from semdb.geometry.stacks import invert_poses, perturbed
 from semdb.trajectory.adjustment import SharedPoints, adjust_keyframes
+from semdb.trajectory.adjustment_kernels import solve_positive
 from semdb.trajectory.options import AdjustmentOptions
 from semdb.types import BoolArray, FloatArray
 
@@ -146,3 +147,14 @@ def test_sparse_and_dense_equations_have_the_same_solution(monkeypatch: pytest.M
     monkeypatch.setattr(adjustment, "DENSE_SHARE", 2.0)
     sparse = adjust_keyframes(made.shared, made.start, made.held, made.rates, OPTIONS)
     np.testing.assert_allclose(sparse.poses, dense.poses, atol=1e-6)
+
+
+def test_positive_equations_are_solved_and_others_are_refused() -> None:
+    rng = np.random.default_rng(3)
+    half = rng.normal(size=(45, 60))
+    matrix, right = half @ half.T, rng.normal(size=45)
+    found = right.copy()
+    assert solve_positive(np.triu(matrix), found)
+    np.testing.assert_allclose(found, np.linalg.solve(matrix, right), rtol=1e-10)
+    matrix[20, 20] = -1.0
+    assert not solve_positive(matrix, right.copy())

@@ -8,19 +8,21 @@ import numpy as np
 import pytest
 
 from semdb.evaluation.trajectory_errors import rigid_alignment, trajectory_errors
-from semdb.geometry import invert_pose, pose_error, pose_from, so3_exp
+from semdb.geometry import invert_pose, pose_error, pose_from, so3_exp, transform_points
 from semdb.geometry.stacks import adjoints
+from semdb.geometry.volumes import Volume
 from semdb.recordings.base import FrameEntry
 from semdb.recordings.synthetic import SyntheticOptions
 from semdb.recordings.synthetic.writer import SyntheticSequence
 from semdb.trajectory.depth_views import depth_agreement, depth_view
 from semdb.trajectory.files import trajectory_text
+from semdb.trajectory.keyframes import common_view, common_views
 from semdb.trajectory.measuring import joined
 from semdb.trajectory.motion import Motion, turn_rates
 from semdb.trajectory.odometry import FrameState
 from semdb.trajectory.recording import RecordedTrajectory
 from semdb.trajectory.result import FramePose, Trajectory
-from semdb.types import FloatArray
+from semdb.types import Camera, FloatArray
 
 
 def turning(times_s: FloatArray, rate: FloatArray, speed: FloatArray) -> FloatArray:
@@ -152,6 +154,26 @@ def test_depth_that_is_not_there_says_nothing(sequence: SyntheticSequence) -> No
     assert depth_agreement(view, empty, np.eye(4)) is None
     behind = pose_from(so3_exp([0, np.pi, 0]), [0, 0, 0])
     assert depth_agreement(view, view, behind) is None
+
+
+# common view
+
+
+@pytest.mark.parametrize("distortion", [(), (0.1, -0.2, 0.001, 0.002, 0.05)])
+def test_common_views_are_those_of_pairs(distortion: tuple[float, ...]) -> None:
+    rng = np.random.default_rng(4)
+    camera = Camera(640, 480, 525, 525, 319.5, 239.5, distortion)
+    volumes = []
+    for _ in range(30):
+        pose = pose_from(so3_exp(0.4 * rng.normal(size=3)), 0.5 * rng.normal(size=3))
+        local = np.column_stack([rng.uniform(-1, 1, (64, 2)), np.ones(64)]) * rng.uniform(0.5, 4, (64, 1))
+        volumes.append(Volume(camera, pose, transform_points(pose, local)))
+    expected = [common_view(volumes[0], other) for other in volumes]
+    np.testing.assert_array_equal(common_views(volumes[0], volumes), expected)
+    assert np.std(expected) > 0.05
+    empty = Volume(camera, np.eye(4), np.zeros((0, 3)))
+    np.testing.assert_array_equal(common_views(volumes[0], [volumes[1], empty]), [expected[1], 0.0])
+    assert len(common_views(volumes[0], [])) == 0
 
 
 # edges
