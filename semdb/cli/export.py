@@ -13,7 +13,7 @@ from semdb.cli.options import JsonFlag, Overrides, open_database, settings_optio
 @settings_options(models=False)
 def command(
     overrides: Overrides,
-    form: Annotated[str, typer.Argument(metavar="FORMAT", help="tum, colmap, kapture, ply, mcap, g2o or semdb.")],
+    form: Annotated[str, typer.Argument(metavar="FORMAT", help="tum, colmap, kapture, ply, mcap, rrd, g2o or semdb.")],
     map_name: Annotated[str, typer.Argument(metavar="MAP", help="Name of the map.")],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="File or folder to write, which must not be there.")],
     voxel: Annotated[float, typer.Option("--voxel", metavar="M", help="ply: one point in so large a cube.")] = 0.02,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -145,6 +146,58 @@ def test_ply(map_url: str, tmp_path: Path) -> None:
     assert len(rows) == count > 500
     assert len(np.unique(voxels(rows["p"].astype(float), 0.05))) == count
     assert rows["c"].std() > 10
+
+
+def rows_of_rrd(path: Path) -> dict[str, dict[int, object]]:
+    """The first value of each component by entity and name, by keyframe (-1: all of them)."""
+    chunk = pytest.importorskip("rerun.chunk")
+    found: dict[str, dict[int, object]] = {}
+    for part in chunk.RrdReader(str(path)).stream():
+        batch = part.to_record_batch().to_pydict()
+        assert "log_time" not in batch
+        for name, values in batch.items():
+            for row, value in enumerate(values):
+                if ":" in name and value:
+                    number = batch["keyframe"][row] if "keyframe" in batch else -1
+                    found.setdefault(f"{part.entity_path}:{name}", {})[number] = value[0]
+                    if "time" in batch:
+                        found.setdefault(f"{part.entity_path}:time", {})[number] = batch["time"][row]
+    return found
+
+
+def test_rrd_is_read_back_by_rerun(map_url: str, tmp_path: Path) -> None:
+    with open_store(map_url) as store:
+        about = export_map(store, "rrd", "m", tmp_path / "m.rrd")
+        expected = heads(store)
+        images = [store.load_image(head.id) for head in expected]
+    assert about == f"{KEYFRAMES} cameras, {KEYFRAMES} with depth"
+    rows = rows_of_rrd(tmp_path / "m.rrd")
+    camera = "/map/room/camera"
+    for number, (head, image) in enumerate(zip(expected, images, strict=True)):
+        place = rows[f"{camera}:Transform3D:translation"][number]
+        np.testing.assert_allclose(place, head.world_from_camera[:3, 3], atol=1e-6)
+        turn = np.reshape(rows[f"{camera}:Transform3D:mat3x3"][number], (3, 3)).T  # column by column
+        np.testing.assert_allclose(turn, head.world_from_camera[:3, :3], atol=1e-6)
+        matrix = np.reshape(rows[f"{camera}:Pinhole:image_from_camera"][number], (3, 3)).T
+        np.testing.assert_allclose([matrix[0, 0], matrix[1, 2]], [head.camera.fx, head.camera.cy], rtol=1e-6)
+        assert bytes(rows[f"{camera}/image:EncodedImage:blob"][number]) == image.rgb  # type: ignore[arg-type]
+        assert bytes(rows[f"{camera}/depth:EncodedDepthImage:blob"][number]) == image.depth  # type: ignore[arg-type]
+        assert rows[f"{camera}/depth:EncodedDepthImage:meter"][number] == image.depth_scale
+        assert np.datetime64(rows[f"{camera}:time"][number], "us") == np.datetime64(
+            head.timestamp_ns or 0, "ns"
+        ).astype(  # type: ignore[call-overload]
+            "datetime64[us]"
+        )
+    way = rows["/map/room/path:LineStrips3D:strips"][-1]
+    np.testing.assert_allclose(way, [head.world_from_camera[:3, 3] for head in expected], atol=1e-6)
+
+
+def test_rrd_needs_its_extra_and_rerun_to_be_on(map_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with open_store(map_url) as store:
+        monkeypatch.setitem(sys.modules, "rerun", None)
+        with pytest.raises(UsageError, match=r"needs the rerun extra: pip install 'semdb\[rerun\]'"):
+            export_map(store, "rrd", "m", tmp_path / "m.rrd")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_what_cannot_be_exported(map_url: str, tmp_path: Path) -> None:
