@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Self
 
 from semdb.api.base import Say
 from semdb.api.describing import Describing
+from semdb.api.tracing import Tracing
 from semdb.api.writing import Writing
 from semdb.database.engine import parse_url, sqlite_path
 from semdb.settings import Settings, settings_with
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from semdb.door.protocol import SemanticDatabase
 
 
-class Database(Describing, Writing):
+class Database(Describing, Writing, Tracing):
     """A semantic database. Made by `semdb.open`; close it, or use it in a ``with``.
 
     Any number of threads may ask it at the same time. Networks, indexes and keyframes stay in memory from one call to

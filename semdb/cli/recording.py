@@ -14,6 +14,7 @@ from semdb.cli.options import CameraOption, JsonFlag, Reading, reading_options
 from semdb.shown import measure, number
 
 if TYPE_CHECKING:
+    from semdb.evaluation.pose_comparison import PoseComparison
     from semdb.recordings import DroppedFrame, Recording
     from semdb.recordings.check import Report
     from semdb.types import Camera
@@ -33,6 +34,10 @@ def command(
         bool,
         typer.Option("--check", help="Compare poses, depth, intrinsics, clocks with the images; 1 if wrong."),
     ] = False,
+    trajectory: Annotated[
+        bool,
+        typer.Option("--trajectory", help="With --check: compare all poses with those that images and depth give."),
+    ] = False,
     json: JsonFlag = False,
 ) -> None:
     """Say what a recording holds and which frames cannot be used.
@@ -41,20 +46,26 @@ def command(
     """
     from semdb.cli.output import print_json, print_lines
     from semdb.cli.progress import Progress
+    from semdb.errors import UsageError
     from semdb.recordings import open_recordings, parse_camera
     from semdb.recordings.focus import watched
 
+    if trajectory and not check:
+        raise UsageError("--trajectory compares poses while a recording is checked: give --check too")
     with Progress(f"looking at the files of {path.name}", unit="files") as progress, watched(progress.update):
         recordings = open_recordings(path, None if camera is None else parse_camera(camera), reading)
     if not quick and not check:
         for recording in recordings:
             decode_all(recording)
     reports = [look(recording) if check else None for recording in recordings]
+    compared = [compare(recording) if trajectory else None for recording in recordings]
+    every = list(zip(recordings, reports, compared, strict=True))
     if json:
-        print_json([as_json(r, quick or check, report) for r, report in zip(recordings, reports, strict=True)])
+        print_json([as_json(r, quick or check, report) | comparison_json(poses) for r, report, poses in every])
     else:
-        for position, (recording, report) in enumerate(zip(recordings, reports, strict=True)):
-            print_lines(*[""] * (position > 0), *as_lines(recording, quick or check), *check_lines(report))
+        for position, (recording, report, poses) in enumerate(every):
+            lines = [*as_lines(recording, quick or check), *check_lines(report), *comparison_lines(poses)]
+            print_lines(*[""] * (position > 0), *lines)
     if any(finding.certain for report in reports if report is not None for finding in report.findings):
         raise typer.Exit(1)
 
@@ -82,6 +93,50 @@ def check_lines(report: Report | None) -> list[str]:
     if not report.findings:
         rows.append(("", "nothing contradicts the images"))
     return [f"{label:<12} {text}" for label, text in rows]
+
+
+def compare(recording: Recording) -> PoseComparison | str:
+    """Recorded poses beside estimated ones, or why there is nothing to compare."""
+    from semdb.cli.progress import StagedProgress
+    from semdb.errors import RecordingError
+    from semdb.evaluation.pose_comparison import compare_poses
+    from semdb.trajectory.recording import find_recorded
+
+    if all(entry.world_from_camera is None for entry in recording.entries):
+        return "no poses are recorded: semdb trajectory estimates them"
+    try:
+        with StagedProgress() as progress:
+            return compare_poses(find_recorded(recording, progress=progress.update))
+    except RecordingError as error:
+        return str(error)
+
+
+def comparison_lines(found: PoseComparison | str | None) -> list[str]:
+    """What `--trajectory` adds for people."""
+    if found is None:
+        return []
+    if isinstance(found, str):
+        return [f"{'estimated':<12} {found}"]
+    rows = [("estimated", f"{found.estimated} poses in {found.pieces} pieces; {found.frames} of them are recorded too")]
+    errors = found.errors
+    if errors is not None:
+        off, median, most = (measure(value, 4) for value in (errors.rmse_m, errors.median_m, errors.max_m))
+        rows += [
+            (
+                "",
+                f"recorded: {off} m RMSE, {median} m median off, at most {most} m (frame {found.worst_frame})",
+            ),
+            ("", f"{found.rotation_deg:.2f} deg median; the recorded path is {found.scale:.4f} times as large"),
+            ("", f"(estimated positions are sure to {measure(found.sigma_m, 4)} m)"),
+        ]
+    return [f"{label:<12} {text}" for label, text in rows]
+
+
+def comparison_json(found: PoseComparison | str | None) -> dict[str, Any]:
+    """What `--trajectory --json` adds: metres and degrees, null where they are not known."""
+    if found is None:
+        return {}
+    return {"trajectory": {"problem": found} if isinstance(found, str) else {"problem": None, **asdict(found)}}
 
 
 def decode_all(recording: Recording) -> None:

@@ -57,11 +57,10 @@ def command(
 
 def encoder_of(spec: str | None) -> PlaceEncoder | None:
     """The place encoder that an option or SEMDB_ENCODER names; None: the one that needs no file."""
+    from semdb.api.tracing import encoder_named
     from semdb.cli.options import load_settings
-    from semdb.perception.encoders import load_encoder
 
-    settings = load_settings(**({} if spec is None else {"encoder": spec}))
-    return None if settings.encoder == "auto" else load_encoder(settings.encoder, settings)
+    return encoder_named(load_settings(**({} if spec is None else {"encoder": spec})))
 
 
 def check_outputs(out: Path | None, json_file: Path | None, plot: Path | None) -> None:

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from semdb.recordings.base import Recording
     from semdb.recordings.options import ReadOptions
     from semdb.refinement.run import StepResult
+    from semdb.trajectory.recording import RecordedTrajectory
     from semdb.types import Frame, ModelInfo
 
     Source: TypeAlias = PathText | Sequence[PathText] | Recording | Iterable[Frame]
@@ -97,6 +98,17 @@ class SemanticDatabase(Protocol):
         depth_scale: float | None = None,
         progress: Callable[[str, int, int], None] | None = None,
     ) -> list[IngestSummary]: ...
+
+    def trajectory(
+        self,
+        source: Source,
+        *,
+        every: int = 1,
+        camera: CameraLike | None = None,
+        reading: ReadOptions | None = None,
+        depth_scale: float | None = None,
+        progress: Callable[[str, int, int], None] | None = None,
+    ) -> RecordedTrajectory: ...
 
     def refine(
         self,

@@ -45,7 +45,7 @@ def find_recorded(
     RecordingError for a recording without depth, or without a frame that can be placed.
     """
     if every < 1:
-        raise UsageError(f"--every must be at least 1, but is {every}")
+        raise UsageError(f"every must be at least 1, but is {every}")
     entries = recording.entries[::every]
     if not any(entry.depth_path is not None for entry in entries):
         raise RecordingError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import semdb
 from semdb.cli.main import app
 from semdb.errors import FrameError, RecordingError, UsageError
 from semdb.evaluation.trajectory_errors import trajectory_errors
@@ -25,7 +26,7 @@ from semdb.trajectory.options import TrajectoryOptions
 from semdb.trajectory.recording import find_recorded
 from semdb.trajectory.result import Trajectory
 from semdb.trajectory.run import find_trajectory
-from semdb.types import Camera, Float32Array, FloatArray, ImageArray
+from semdb.types import Camera, Float32Array, FloatArray, Frame, ImageArray
 from tests.rooms import SMALL
 
 Picture = tuple[ImageArray, Float32Array | None]
@@ -238,7 +239,7 @@ def test_a_recording_is_found_whatever_poses_it_has(room_path: Path) -> None:
     true = np.stack([entry.world_from_camera for entry in found.entries if entry.world_from_camera is not None])
     metres, _ = errors_of(found.trajectory, true)
     assert metres < 0.006
-    with pytest.raises(UsageError, match="--every must be at least 1"):
+    with pytest.raises(UsageError, match="every must be at least 1"):
         find_recorded(recording, every=0)
 
 
@@ -297,3 +298,35 @@ def test_a_recording_of_black_frames_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "camera.json").write_text('{"fx": 60, "fy": 60, "cx": 32, "cy": 24, "width": 64, "height": 48}')
     with pytest.raises(RecordingError, match="no frame can be placed; the first: too dark"):
         find_recorded(open_recording(tmp_path), options=TrajectoryOptions(threads=1))
+
+
+def test_recorded_poses_are_compared_with_estimated_ones(room_path: Path, tmp_path: Path) -> None:
+    found = CliRunner().invoke(app, ["recording", str(room_path), "--check", "--trajectory", "--json"])
+    assert found.exit_code == 0, found.output
+    [told] = json.loads(found.stdout)
+    compared = told["trajectory"]
+    assert compared["frames"] == compared["estimated"] == 24
+    assert compared["errors"]["rmse_m"] < 0.005
+    assert compared["rotation_deg"] < 0.3
+    assert compared["scale"] == pytest.approx(1.0, abs=0.02)
+    for name in ("rgb", "rgb.txt", "depth", "depth.txt", "camera.json"):
+        (tmp_path / name).symlink_to(room_path / name)
+    without = CliRunner().invoke(app, ["recording", str(tmp_path), "--check", "--trajectory"])
+    assert "no poses are recorded: semdb trajectory estimates them" in without.stdout
+    assert CliRunner().invoke(app, ["recording", str(room_path), "--trajectory"]).exit_code == 2
+
+
+def test_the_door_finds_a_trajectory_of_a_folder_and_of_frames(room_path: Path, tmp_path: Path) -> None:
+    def frames() -> Iterator[Frame]:
+        for n, seen in enumerate(list(open_recording(room_path).frames())[::3]):
+            yield semdb.make_frame(n, seen.image, depth=seen.depth, camera=seen.camera, timestamp_ns=seen.timestamp_ns)
+
+    with semdb.open(f"sqlite:///{tmp_path}/none.sqlite3") as db:
+        folder, memory = db.trajectory(room_path, every=3), db.trajectory(frames())
+        with pytest.raises(UsageError, match="every must be at least 1"):
+            db.trajectory(room_path, every=0)
+    assert not (tmp_path / "none.sqlite3").exists()
+    assert len(folder.trajectory.used) == len(memory.trajectory.used) == 8
+    assert [entry.timestamp_ns for entry in folder.entries] == [entry.timestamp_ns for entry in memory.entries]
+    for one, two in zip(folder.trajectory.used, memory.trajectory.used, strict=True):
+        np.testing.assert_allclose(one.world_from_camera, two.world_from_camera, atol=0.005)

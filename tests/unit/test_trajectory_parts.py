@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from semdb.evaluation.pose_comparison import compare_poses
 from semdb.evaluation.trajectory_errors import rigid_alignment, trajectory_errors
 from semdb.geometry import invert_pose, pose_error, pose_from, so3_exp, transform_points
 from semdb.geometry.stacks import adjoints
@@ -21,7 +22,7 @@ from semdb.trajectory.measuring import joined
 from semdb.trajectory.motion import Motion, turn_rates
 from semdb.trajectory.odometry import FrameState
 from semdb.trajectory.recording import RecordedTrajectory
-from semdb.trajectory.result import FramePose, Trajectory
+from semdb.trajectory.result import FramePose, PieceSummary, Trajectory
 from semdb.types import Camera, FloatArray
 
 
@@ -212,3 +213,38 @@ def test_files_have_the_times_of_the_recording() -> None:
     untimed = trajectory_text(RecordedTrajectory(trajectory, (entry,), False))
     assert "frame index" in untimed.splitlines()[1]
     assert untimed.splitlines()[3].startswith("7.000000000 ")
+
+
+# recorded poses beside estimated ones
+
+
+def test_comparison_of_poses_finds_scale_and_the_worst_frame() -> None:
+    rng = np.random.default_rng(6)
+    true = [pose_from(so3_exp(0.3 * rng.normal(size=3)), [0.1 * n, np.sin(0.3 * n), 0.02 * n]) for n in range(40)]
+    world = pose_from(so3_exp([0.3, -1.0, 2.0]), [4.0, 5.0, 6.0])
+    recorded = []
+    for pose in true:
+        moved = world @ pose
+        moved[:3, 3] = world[:3, 3] + 1.02 * (moved[:3, 3] - world[:3, 3])
+        recorded.append(moved)
+    recorded[17] = pose_from(np.eye(3), [0.0, 0.3, 0.0]) @ recorded[17]
+    spread = np.diag([4e-6] * 3 + [1e-6] * 3)
+    frames = tuple(
+        FramePose(n, FrameState.TRACKED, piece=0, world_from_camera=pose, covariance=spread)
+        for n, pose in enumerate(true)
+    )
+    entries = tuple(
+        FrameEntry(n, f"{n}.png", n * 33_000_000, Path(f"{n}.png"), None, None, pose) for n, pose in enumerate(recorded)
+    )
+    pieces = (PieceSummary(0, 40, 5, 0, 39),)
+    trajectory = Trajectory(frames, (), (), pieces, (), 0.0, {})
+    found = compare_poses(RecordedTrajectory(trajectory, entries, True))
+    assert found.errors is not None
+    assert (found.frames, found.estimated, found.worst_frame) == (40, 40, 17)
+    assert found.scale == pytest.approx(1.02, abs=0.005)
+    assert found.errors.max_m == pytest.approx(0.3, abs=0.03)
+    assert found.rotation_deg < 0.01
+    assert found.sigma_m == pytest.approx(np.sqrt(12e-6))
+    few = compare_poses(RecordedTrajectory(Trajectory(frames[:2], (), (), pieces, (), 0.0, {}), entries, True))
+    assert few.errors is None
+    assert few.frames == 2
