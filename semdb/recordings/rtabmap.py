@@ -6,6 +6,7 @@ calibration has the pose of each camera in it. Images of several cameras stand s
 
 from __future__ import annotations
 
+import contextlib
 import sqlite3
 import struct
 import threading
@@ -24,27 +25,18 @@ from semdb.recordings.assembly import Draft, finish
 from semdb.recordings.base import DroppedFrame, FrameEntry, Layout, RawColor, RawDepth, Recording
 from semdb.recordings.cameras import with_size
 from semdb.recordings.images import decode_any, decode_color, scaled_depth
-from semdb.recordings.lens import Lens, as_camera
+from semdb.recordings.lens import as_camera
 from semdb.recordings.options import ReadOptions
 from semdb.recordings.own_depth import DepthCamera, as_raw, in_color, resized
 from semdb.recordings.poses import rigid_pose
+from semdb.recordings.rtabmap_calibration import NodeCamera, parse_calibration
 from semdb.recordings.rvl import decode_rvl
-from semdb.shown import number
 from semdb.types import Camera, Float32Array, FloatArray
 
 TABLES = {"Node", "Data", "Admin", "Link"}
 OLDEST = (0, 11, 10)  # since when images lie in Data as they do now
 RVL = b"DEPTHRVL"
 MILLIMETRES = 1000.0
-MONO = 0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class NodeCamera:
-    """One camera of a node: its intrinsics, and its pose in the base."""
-
-    lens: Lens
-    base_from_camera: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,12 +85,13 @@ def _open(path: Path, camera: Camera | None, options: ReadOptions) -> Recording:
         raise RecordingError(f"{path}: RTAB-Map {version}: has no nodes with data")
     session = Counter(row[1] for row in rows).most_common(1)[0][0]
     if not optimised:
-        notes.append("no optimised poses (Admin.opt_poses): poses are the robot's odometry, which drifts")
+        notes.append(_odometry_note(connection))
     entries: list[FrameEntry] = []
     dropped: list[DroppedFrame] = []
     places: dict[int, _Place] = {}
     cameras: dict[bytes, tuple[list[NodeCamera], list[tuple[Camera, str | None]]]] = {}
     total = 0
+    most = _most_cameras({row[6] or b"" for row in rows})
     for node, map_id, stamp, blob, image_size, depth_size, calibration in rows:
         name = f"node {node}"
         total += 1
@@ -123,7 +116,7 @@ def _open(path: Path, camera: Camera | None, options: ReadOptions) -> Recording:
         parts = len(known[0])
         total += parts - 1
         for part, (item, (found, note)) in enumerate(zip(*known, strict=True)):
-            index = node * parts + part
+            index = node * most + part
             places[index] = _Place(node, part, parts)
             if note and note not in notes:
                 notes.append(note)
@@ -160,6 +153,27 @@ def _open(path: Path, camera: Camera | None, options: ReadOptions) -> Recording:
         contents=_contents(connection, version, optimised),
     )
     return finish(draft, camera)
+
+
+def _odometry_note(connection: sqlite3.Connection) -> str:
+    """What is said of a database that was never optimised: its loop closures are not made use of."""
+    closures = connection.execute(
+        "SELECT count(*) FROM Link WHERE type BETWEEN 1 AND 4 AND from_id < to_id"
+    ).fetchone()[0]
+    unused = f", and the {closures} loop closure(s) in Link are not used" if closures else ""
+    return (
+        f"no optimised poses (Admin.opt_poses): poses are the robot's odometry, which drifts{unused}; opened and "
+        "closed once in rtabmap the database has them"
+    )
+
+
+def _most_cameras(calibrations: set[bytes]) -> int:
+    """How many cameras a node has at most: nodes may differ, and frames' numbers may not meet."""
+    most = 1
+    for calibration in calibrations:
+        with contextlib.suppress(ValueError):  # said of each node
+            most = max(most, len(parse_calibration(calibration)))
+    return most
 
 
 class _RtabmapData:
@@ -229,80 +243,6 @@ def decode_depth_blob(data: bytes, name: str) -> tuple[npt.NDArray[Any], bytes |
         with np.errstate(invalid="ignore"):
             return np.where(metres > 0, metres, np.float32(np.nan)), None
     raise FrameError(f"{name}: is no depth image: it is of {image.dtype} with {image.shape} values (a right image?)")
-
-
-def parse_calibration(data: bytes) -> list[NodeCamera]:
-    """The cameras of a calibration blob of RTAB-Map 0.11.10 or newer. Raises ValueError with the reason."""
-    if not data:
-        raise ValueError("has no calibration")
-    for parse in (_parse_models, _parse_floats):
-        found = parse(data)
-        if found:
-            return found
-    raise ValueError(f"has a calibration of {len(data)} bytes that is not known (stereo is not read)")
-
-
-def _parse_models(data: bytes) -> list[NodeCamera] | None:
-    """Since 0.18: for each camera 11 integers, then K, D, R, P as float64 and the pose in the base as float32."""
-    found, at = [], 0
-    while at < len(data):
-        if len(data) - at < 44:
-            return None
-        major, _, _, kind, width, height, *counts = struct.unpack_from("<11i", data, at)
-        sizes = [count * 8 for count in counts[:4]] + [counts[4] * 4]
-        if not 0 <= major <= 1 or kind != MONO or min(counts) < 0 or sum(sizes) > len(data) - at - 44:
-            return None
-        at += 44
-        k, d, _, p = (np.frombuffer(data, "<f8", count, at + sum(sizes[:i])) for i, count in enumerate(counts[:4]))
-        local = np.frombuffer(data, "<f4", counts[4], at + sum(sizes[:4])).astype(np.float64)
-        at += sum(sizes)
-        if k.size != 9 or local.size not in (0, 12):
-            return None
-        if p.size == 12 and p[0] > 0 and p[5] > 0:  # images are rectified where there is a projection
-            lens = Lens(width, height, float(p[0]), float(p[5]), float(p[2]), float(p[6]))
-        elif d.size == 6:  # its fisheye: k1, k2, 0, 0, k3, k4
-            lens = _lens(width, height, k, "fisheye", (d[0], d[1], d[4], d[5]))
-        else:
-            lens = _lens(width, height, k, "radial", tuple(d[:8]))
-        found.append(NodeCamera(_checked(lens), np.eye(4) if local.size == 0 else rigid_pose(local.reshape(3, 4))))
-    return found
-
-
-def _parse_floats(data: bytes) -> list[NodeCamera] | None:
-    """0.11 to 0.17: for each camera fx, fy, cx, cy, perhaps width and height, and the pose in the base, float32."""
-    if len(data) % 4:
-        return None
-    values = np.frombuffer(data, "<f4").astype(np.float64)
-    if values.size % 18:
-        return None
-    found = []
-    for row in values.reshape(-1, 18):
-        fx, fy, cx, cy, width, height = (float(value) for value in row[:6])
-        if width != round(width) or height != round(height):
-            return None
-        found.append(
-            NodeCamera(_checked(Lens(int(width), int(height), fx, fy, cx, cy)), rigid_pose(row[6:].reshape(3, 4)))
-        )
-    return found
-
-
-def _lens(width: int, height: int, k: FloatArray, model: str, coefficients: tuple[float, ...]) -> Lens:
-    own = tuple(float(value) for value in coefficients)
-    return Lens(width, height, float(k[0]), float(k[4]), float(k[2]), float(k[5]), model, own if any(own) else ())
-
-
-def _checked(lens: Lens) -> Lens:
-    numbers = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.coefficients)
-    if (
-        not np.isfinite(numbers).all()
-        or min(lens.fx, lens.fy) <= 0
-        or not (0 < lens.width < 32768 and 0 < lens.height < 32768)
-    ):
-        raise ValueError(
-            f"has a calibration that makes no sense: {lens.width}x{lens.height}, fx {number(lens.fx)}, "
-            f"fy {number(lens.fy)}"
-        )
-    return lens
 
 
 def _camera_of(item: NodeCamera) -> tuple[Camera, str | None]:

@@ -103,6 +103,34 @@ def test_images_are_localized_alike_in_an_imported_map(map_url: str, room: Path,
         np.testing.assert_array_equal(one.world_from_camera, two.world_from_camera)
 
 
+def test_images_are_localized_alike_in_maps_of_what_was_exported(
+    room: Path, tmp_path: Path, networks: dict[str, str]
+) -> None:
+    """A recording, exported in the formats that keep depth, ingested again: the same keypoints, the same answers."""
+    url = f"sqlite:///{tmp_path / 'm.sqlite3'}"
+    own = Settings(database_url=url, threads=1, check_recordings=False, **networks)  # type: ignore[arg-type]
+    ingest_recordings([room], own, IngestOptions(map_name="m", keyframes=KEYFRAMES))
+    forms = ("kapture", "mcap")
+    for form in forms:
+        with open_store(url) as store:
+            export_map(store, form, "m", tmp_path / f"out.{form}")
+        ingest_recordings([tmp_path / f"out.{form}"], own, IngestOptions(map_name=form, stride=1))
+    recording = open_recording(room)
+    images = [entry.image_path for entry in recording.entries[1::8]]
+    with semdb_open(url, threads=1, **networks) as database:
+        answers = {name: list(database.localize(images, map=name, like=room)) for name in ("m", *forms)}
+    assert all(answer.verdict == "localized" for answer in answers["m"])
+    for form in forms:
+        for one, two in zip(answers["m"], answers[form], strict=True):
+            assert two.verdict == one.verdict
+            assert one.world_from_camera is not None
+            assert two.world_from_camera is not None
+            metres, degrees = pose_error(one.world_from_camera, two.world_from_camera)
+            assert metres < 1e-3  # depth of mcap is in millimetres
+            assert degrees < 0.02
+            assert abs(one.inliers - two.inliers) <= 0.02 * one.inliers
+
+
 def test_colmap_is_read_by_pycolmap_and_points_fit_their_pixels(map_url: str, tmp_path: Path) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     with open_store(map_url) as store:

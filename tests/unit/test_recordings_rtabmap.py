@@ -11,7 +11,7 @@ import pytest
 from semdb.errors import RecordingError
 from semdb.geometry import pose_error
 from semdb.recordings import open_recording
-from semdb.recordings.rtabmap import parse_calibration
+from semdb.recordings.rtabmap_calibration import parse_calibration
 from tests.unit.recording_formats import PHONE, RtabmapPlan, rtabmap_camera_pose, write_rtabmap
 from tests.unit.recording_miniatures import pose, render
 
@@ -39,8 +39,12 @@ def test_nodes_become_frames(tmp_path: Path, depth: str, factor: int, error: flo
 
 
 def test_without_optimised_poses_it_is_odometry_and_said(tmp_path: Path) -> None:
-    recording = open_recording(write_rtabmap(tmp_path / "home.db", RtabmapPlan(optimised=False)))
-    assert "odometry, which drifts" in recording.notes[0]
+    path = write_rtabmap(tmp_path / "home.db", RtabmapPlan(optimised=False))
+    assert "odometry, which drifts; opened" in open_recording(path).notes[0]
+    with sqlite3.connect(path) as connection:
+        connection.executemany("INSERT INTO Link VALUES (?, ?, ?, x'', x'')", [(1, 2, 0), (4, 1, 1), (1, 4, 1)])
+    recording = open_recording(path)
+    assert "odometry, which drifts, and the 1 loop closure(s) in Link are not used" in recording.notes[0]
     assert len(recording.entries) == 4
 
 
@@ -71,6 +75,17 @@ def test_cameras_side_by_side_are_frames_of_their_own(tmp_path: Path) -> None:
         assert frame.world_from_camera is not None
         assert np.nanmax(np.abs(frame.depth - z)) <= 6e-4
         assert max(pose_error(frame.world_from_camera, truth)) < 1e-4
+
+
+def test_nodes_with_more_and_with_fewer_cameras_have_numbers_of_their_own(tmp_path: Path) -> None:
+    path, other = write_rtabmap(tmp_path / "home.db", RtabmapPlan(cameras=2)), write_rtabmap(tmp_path / "one.db")
+    with sqlite3.connect(path) as connection:
+        connection.execute("ATTACH ? AS one", (str(other),))
+        connection.execute("DELETE FROM main.Data WHERE id = 2")
+        connection.execute("INSERT INTO main.Data SELECT * FROM one.Data WHERE id = 2")
+    recording = open_recording(path)
+    assert [entry.index for entry in recording.entries] == [2, 3, 4, 6, 7, 8, 9]
+    assert [frame.index for frame in recording.frames()] == [2, 3, 4, 6, 7, 8, 9]
 
 
 @pytest.mark.parametrize(
