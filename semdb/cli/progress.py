@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Mapping
 from types import TracebackType
 from typing import Any, Self, TextIO
 
@@ -85,10 +86,14 @@ def _rich_bar(stream: TextIO) -> Any:
 
 
 class StagedProgress:
-    """Progress of work in several stages: a bar for each stage that is named, one after the other."""
+    """Progress of work in several stages: a bar for each stage that is named, one after the other.
 
-    def __init__(self) -> None:
+    `units` says by stage what is counted, where it is not frames.
+    """
+
+    def __init__(self, units: Mapping[str, str] | None = None) -> None:
         self._label = ""
+        self._units = dict(units or {})
         self._current: Progress | None = None
 
     def __enter__(self) -> Self:
@@ -109,7 +114,7 @@ class StagedProgress:
         if label != self._label or self._current is None:
             self._end()
             self._label = label
-            self._current = Progress(label).__enter__()
+            self._current = Progress(label, self._units.get(label, "frames")).__enter__()
         self._current.update(done, total)
 
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from semdb.trajectory.recording import RecordedTrajectory
 
 REASONS_SHOWN = 5
+UNITS = {"closing loops": "pairs", "bundle adjustment": "rounds"}  # what is counted, where it is not frames
 
 
 @reading_options()
@@ -48,7 +49,7 @@ def command(
     check_outputs(out, json_file, plot)
     chosen = encoder_of(encoder)
     started = time.perf_counter()
-    with StagedProgress() as progress:
+    with StagedProgress(UNITS) as progress:
         found = find_recorded(recording, every=every, encoder=chosen, progress=progress.update)
     seconds = time.perf_counter() - started
     write(found, recording, seconds, out, json_file, plot)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,6 +49,31 @@ def volume_of(camera: Camera, world_from_camera: FloatArray, xy: Float32Array, p
     return Volume(camera, world_from_camera, transform_points(world_from_camera, chosen))
 
 
+def common_view(one: Volume, two: Volume) -> float:
+    """The lesser share of the points of one that fall into the other's image."""
+    if not len(one.points) or not len(two.points):
+        return 0.0
+    return min(one.share_of(two.points), two.share_of(one.points))
+
+
+def common_views(one: Volume, others: Sequence[Volume]) -> FloatArray:
+    """`common_view` of one with each of others ``[n]``: all at once where their cameras are the same."""
+    alike = all(other.camera == one.camera and len(other.points) == len(one.points) > 0 for other in others)
+    if len(others) < 2 or not alike:
+        return np.array([common_view(one, other) for other in others], np.float64)
+    poses = np.stack([other.world_from_camera for other in others])
+    theirs = np.stack([other.points for other in others])
+    here = (theirs - one.world_from_camera[:3, 3]) @ one.world_from_camera[:3, :3]
+    there = (one.points[None] - poses[:, None, :3, 3]) @ poses[:, :3, :3]
+    local = np.concatenate([here, there]).reshape(-1, 3)
+    front = local[:, 2] > LEAST_DEPTH_M
+    depth = np.where(front, local[:, 2], 1.0)
+    xy = normalized_to_pixels(one.camera, local[:, :2] / depth[:, None])
+    inside = front & (xy > 0).all(axis=1) & (xy < [one.camera.width - 1, one.camera.height - 1]).all(axis=1)
+    shares = inside.reshape(2, len(others), -1).mean(axis=2)
+    return np.asarray(shares.min(axis=0), np.float64)
+
+
 def neighbour_pairs(
     volumes: list[Volume], neighbours: int, least_share: float, candidates: int
 ) -> list[tuple[int, int]]:
@@ -61,13 +87,10 @@ def neighbour_pairs(
     shares: dict[tuple[int, int], float] = {}
     found: set[tuple[int, int]] = set()
     for i, row in enumerate(np.atleast_2d(near.reshape(len(volumes), -1))):
-        ranked = []
-        for j in sorted({int(j) for j in row} - {i}):
-            pair = min(i, j), max(i, j)
-            if pair not in shares:
-                one, two = volumes[pair[0]], volumes[pair[1]]
-                shares[pair] = min(one.share_of(two.points), two.share_of(one.points))
-            if shares[pair] >= least_share:
-                ranked.append((-shares[pair], pair))
+        pairs = {j: (min(i, j), max(i, j)) for j in sorted({int(j) for j in row} - {i})}
+        new = [j for j, pair in pairs.items() if pair not in shares]
+        found_shares = common_views(volumes[i], [volumes[j] for j in new]).tolist()
+        shares |= {pairs[j]: share for j, share in zip(new, found_shares, strict=True)}
+        ranked = [(-shares[pair], pair) for pair in pairs.values() if shares[pair] >= least_share]
         found.update(pair for _, pair in sorted(ranked)[:neighbours])
     return sorted(found)

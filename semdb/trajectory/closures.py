@@ -7,11 +7,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from semdb.geometry import invert_pose, pose_distances, pose_error
+from semdb.geometry.volumes import common_view, common_views
 from semdb.localization.confidence import sigmas
 from semdb.localization.views import KeyframeView
 from semdb.trajectory.depth_views import depth_agreement
 from semdb.trajectory.edges import Edge, EdgeKind, EdgeState
-from semdb.trajectory.keyframes import Keyframes, common_view, common_views
+from semdb.trajectory.keyframes import Keyframes
 from semdb.trajectory.measuring import joined
 from semdb.trajectory.observations import FrameObservations, observations_of
 from semdb.trajectory.odometry import local_covariance

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
 
-from semdb.geometry import invert_pose, normalized_to_pixels, pose_distances, transform_points
-from semdb.geometry.volumes import LEAST_DEPTH_M, Volume
+from semdb.geometry import invert_pose, pose_distances, transform_points
+from semdb.geometry.volumes import Volume
 from semdb.localization.views import KeyframeView, View
 from semdb.trajectory.depth_views import DepthView
 from semdb.types import BoolArray, Float32Array, FloatArray
@@ -88,31 +88,6 @@ def sample_of(view: View) -> FloatArray:
     if not len(known):
         return np.zeros((0, 3))
     return np.asarray(known[np.linspace(0, len(known) - 1, SAMPLES).astype(int)])
-
-
-def common_view(one: Volume, two: Volume) -> float:
-    """The lesser share of the points of one that fall into the other's image."""
-    if not len(one.points) or not len(two.points):
-        return 0.0
-    return min(one.share_of(two.points), two.share_of(one.points))
-
-
-def common_views(one: Volume, others: Sequence[Volume]) -> FloatArray:
-    """`common_view` of one with each of others ``[n]``: all at once where their cameras are the same."""
-    alike = all(other.camera == one.camera and len(other.points) == len(one.points) > 0 for other in others)
-    if len(others) < 2 or not alike:
-        return np.array([common_view(one, other) for other in others], np.float64)
-    poses = np.stack([other.world_from_camera for other in others])
-    theirs = np.stack([other.points for other in others])
-    here = (theirs - one.world_from_camera[:3, 3]) @ one.world_from_camera[:3, :3]
-    there = (one.points[None] - poses[:, None, :3, 3]) @ poses[:, :3, :3]
-    local = np.concatenate([here, there]).reshape(-1, 3)
-    front = local[:, 2] > LEAST_DEPTH_M
-    depth = np.where(front, local[:, 2], 1.0)
-    xy = normalized_to_pixels(one.camera, local[:, :2] / depth[:, None])
-    inside = front & (xy > 0).all(axis=1) & (xy < [one.camera.width - 1, one.camera.height - 1]).all(axis=1)
-    shares = inside.reshape(2, len(others), -1).mean(axis=2)
-    return np.asarray(shares.min(axis=0), np.float64)
 
 
 def with_points_only(view: View) -> View:

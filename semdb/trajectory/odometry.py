@@ -9,13 +9,13 @@ from enum import StrEnum
 import numpy as np
 
 from semdb.geometry import transform_points
-from semdb.geometry.volumes import Volume
+from semdb.geometry.volumes import Volume, common_views
 from semdb.localization.views import KeyframeView
 from semdb.perception.protocols import Encoder
 from semdb.trajectory.depth_views import depth_agreement
 from semdb.trajectory.edges import Edge, EdgeKind
 from semdb.trajectory.frames import EmptyFrame, SeenFrame
-from semdb.trajectory.keyframes import Keyframe, Keyframes, common_views, sample_of, with_points_only
+from semdb.trajectory.keyframes import Keyframe, Keyframes, sample_of, with_points_only
 from semdb.trajectory.motion import Motion, turn_rates
 from semdb.trajectory.observations import FrameObservations, observations_of
 from semdb.trajectory.options import TrajectoryOptions

@@ -11,13 +11,12 @@ from semdb.evaluation.pose_comparison import compare_poses
 from semdb.evaluation.trajectory_errors import rigid_alignment, trajectory_errors
 from semdb.geometry import invert_pose, pose_error, pose_from, so3_exp, transform_points
 from semdb.geometry.stacks import adjoints
-from semdb.geometry.volumes import Volume
+from semdb.geometry.volumes import Volume, common_view, common_views
 from semdb.recordings.base import FrameEntry
 from semdb.recordings.synthetic import SyntheticOptions
 from semdb.recordings.synthetic.writer import SyntheticSequence
 from semdb.trajectory.depth_views import depth_agreement, depth_view
 from semdb.trajectory.files import trajectory_text
-from semdb.trajectory.keyframes import common_view, common_views
 from semdb.trajectory.measuring import joined
 from semdb.trajectory.motion import Motion, turn_rates
 from semdb.trajectory.odometry import FrameState
