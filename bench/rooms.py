@@ -34,6 +34,7 @@ from semdb.recordings.synthetic import SyntheticFrame, SyntheticOptions, Synthet
 from semdb.recordings.synthetic.mistakes import make_mistakes, with_misnamed
 from semdb.recordings.synthetic.writer import building
 from semdb.refinement.run import refine_map
+from semdb.refinement.steps import FOR_LOCALIZATION
 from semdb.settings import Settings
 from semdb.types import Camera, Description, FloatArray, InstanceMasks, Verdict
 
@@ -90,7 +91,7 @@ def compare(
     described = _describe(rooms, *DETECTORS[detector], features)
     with tempfile.TemporaryDirectory() as folder, open_store(f"sqlite:///{folder}/rooms.sqlite3", create=True) as store:
         _fill(store, described)
-        refine_map(store, store.find_map("building"))
+        refine_map(store, store.find_map("building"), kinds=FOR_LOCALIZATION)
         return [_ask(store, described, detector, method) for method in methods]
 
 

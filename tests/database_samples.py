@@ -5,10 +5,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from sqlalchemy import select
 
+from semdb.database import retry, tables
+from semdb.database.ids import SharedIds
+from semdb.database.landmark_records import (
+    GravityRow,
+    LandmarkRelation,
+    LandmarkRow,
+    LandmarkSet,
+    LandmarkSighting,
+    LandmarkView,
+)
+from semdb.database.landmark_rows import replace_landmarks
 from semdb.database.records import KeyframeRecord, RecordingPlan
 from semdb.database.store import Store
 from semdb.geometry import pose_from, so3_exp
+from semdb.landmarks.identity import keep_ids
 from semdb.types import (
     Camera,
     Description,
@@ -122,3 +135,52 @@ def fill(
     ]
     store.finish_recording(planned.recording_id)
     return map_id, planned.recording_id, ids
+
+
+def stored_landmarks(store: Store, map_id: int) -> list[int]:
+    """A table with a cup on it and a chair beside it, a sink with a cup, a banana, and a book on the floor.
+
+    Returns their ids. Sightings are the objects of the map's first keyframes, as far as they go.
+    """
+    things = [
+        ("dining table", (2.0, 1.0, 0.4), (1.6, 0.9, 0.75)),
+        ("cup", (2.2, 1.1, 0.82), (0.1, 0.1, 0.1)),
+        ("chair", (1.0, 1.0, 0.45), (0.4, 0.4, 0.9)),
+        ("sink", (-2.0, 0.0, 0.9), (0.6, 0.5, 0.2)),
+        ("cup", (-1.8, 0.3, 0.95), (0.1, 0.1, 0.1)),
+        ("banana", (2.4, 0.9, 0.8), (0.2, 0.05, 0.04)),
+        ("book", (0.0, -1.0, 0.02), (0.2, 0.15, 0.03)),
+    ]
+    SharedIds(store.engine).categories([name for name, *_ in things])
+    query = select(tables.objects.c.id, tables.objects.c.keyframe_id)
+    query = query.select_from(tables.objects.join(tables.keyframes).join(tables.recordings))
+    query = query.where(tables.recordings.c.map_id == map_id).order_by(tables.objects.c.id)
+    with store.engine.connect() as connection:
+        seen = [(int(row.id), int(row.keyframe_id)) for row in connection.execute(query)]
+    rows = []
+    for number, (name, position, size) in enumerate(things):
+        mine = seen[number :: len(things)]
+        rows.append(
+            LandmarkRow(
+                *(name, 0.97, {name: 0.97, "vase": 0.03}, position, np.eye(3) * 1e-4, size, 0.1),
+                *(max(len(mine), 1), 1, 0, "confirmed", seen[0][1], seen[-1][1], 10**9 * number, 10**9 * (number + 5)),
+                tuple(LandmarkSighting(key, 0.9, 0.8) for key, _ in mine),
+                tuple(LandmarkView(key, 0.7, 1.5) for key, _ in mine[:3]),
+            )
+        )
+    relations = [
+        (1, "on", 0, 0.98),
+        (2, "next_to", 0, 0.9),
+        (4, "near", 3, 0.8),
+        (3, "near", 4, 0.8),
+        (5, "on", 0, 0.9),
+    ]
+    found = LandmarkSet(
+        tuple(rows),
+        tuple(LandmarkRelation(*relation) for relation in relations),
+        GravityRow((0.0, 0.0, 1.0), 0.9, 0.0, 0.8, given=False),
+    )
+    written = retry.write(store.engine, lambda connection: replace_landmarks(connection, map_id, found, keep_ids))
+    assert written == len(things)
+    with store.engine.connect() as connection:
+        return list(connection.execute(select(tables.landmarks.c.id).order_by(tables.landmarks.c.id)).scalars())

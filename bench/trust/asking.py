@@ -19,6 +19,7 @@ from semdb.localization.verdict import VerdictOptions
 from semdb.perception.describe import Describer, describer_from_specs
 from semdb.perception.model_choice import specs_for_ingest
 from semdb.refinement.run import refine_map
+from semdb.refinement.steps import FOR_LOCALIZATION
 from semdb.settings import Settings
 
 # every pose is reported; the verdict is made afterwards, from the evidence, as a localizer makes it
@@ -52,7 +53,7 @@ def _make_maps(world: World, store: Store, describer: Describer, say: Say) -> di
         ingest_recording(
             plan.recording, store, describer, IngestOptions(map_name=plan.name), entries=list(plan.entries)
         )
-        refine_map(store, store.find_map(plan.name))
+        refine_map(store, store.find_map(plan.name), kinds=FOR_LOCALIZATION)
         made[plan.name] = make_localizer(store, store.find_map(plan.name), "index", ALL_POSES)
         say(f"map {plan.name}: {len(plan.entries)} keyframes")
     return made

@@ -155,6 +155,24 @@ class Writing(Reading):
             raise first
         return results
 
+    def tell_up(self, map: str, up: Sequence[float] | None) -> None:
+        """Notes which way is up in a map, for `refine` from then on; None: it is estimated again.
+
+        Raises UsageError for what is no direction, NotFoundError.
+        """
+        import math
+
+        from semdb.database.landmark_rows import LANDMARKS, give_up
+        from semdb.database.refinements import forget
+
+        length = math.hypot(*up) if up is not None else 1.0
+        if not (up is None or len(up) == 3) or not 1e-6 < length < 1e6:
+            raise UsageError(f"up is a direction, three numbers, not {up}")
+        store = self._store()
+        info = store.find_map(map)
+        give_up(store.engine, info.id, None if up is None else [value / length for value in up])
+        forget(store.engine, info.id, LANDMARKS)
+
     def delete(
         self,
         *,

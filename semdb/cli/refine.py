@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from semdb.cli.options import JsonFlag, Overrides, open_database, settings_options
+
+if TYPE_CHECKING:
+    from semdb.api.database import Database
 
 
 @settings_options(models=False)
@@ -16,10 +19,14 @@ def command(
     step: Annotated[
         list[str] | None, typer.Option("--step", metavar="STEP", help="Only this step; repeatable.")
     ] = None,
+    up: Annotated[
+        str | None,
+        typer.Option("--up", metavar="X,Y,Z", help="Which way is up in the map, or `estimate`; kept from then on."),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Also what is up to date.")] = False,
     json: JsonFlag = False,
 ) -> None:
-    """Compute what needs more than one keyframe: which classes the detector takes for each other.
+    """Compute what needs more than one keyframe: confused classes, better 3D points, landmarks and what is up.
 
     Nothing else depends on it: ingest, deletion and localization work without. Does only what is out of date. A map
     that cannot be refined is named, and makes the exit code 1; the others are refined all the same.
@@ -33,6 +40,8 @@ def command(
     done: list[dict[str, Any]] = []
     failed: list[SemdbError] = []
     with open_database(overrides.settings()) as database:
+        if up is not None:
+            _tell_up(database, map_name, up)
         names = [map_name] if map_name is not None else [info.name for info in database.maps() if info.keyframes]
         for name in names:
             try:
@@ -65,3 +74,19 @@ def command(
         say("there is no keyframe to refine: ingest a recording first")
     if failed:
         raise typer.Exit(failed[0].exit_code)
+
+
+def _tell_up(database: Database, map_name: str | None, up: str) -> None:
+    """Notes which way is up in a map. Raises UsageError."""
+    from semdb.errors import UsageError
+
+    names = [map_name] if map_name is not None else [info.name for info in database.maps()]
+    if len(names) != 1:
+        raise UsageError("--up is said of one map: name it with --map")
+    try:
+        told = None if up == "estimate" else tuple(float(part) for part in up.split(","))
+    except ValueError:
+        told = ()
+    if told is not None and len(told) != 3:
+        raise UsageError(f"--up {up}: three numbers are expected, as 0,0,1, or `estimate`")
+    database.tell_up(names[0], told)

@@ -14,6 +14,7 @@ from typing import Any
 from sqlalchemy import Connection, Engine, Table, insert, select
 
 from semdb.database import retry, tables
+from semdb.database.copying_landmarks import copy_landmarks
 from semdb.database.ids import new_id
 from semdb.database.records import ChangeKind
 from semdb.database.refinements import map_state
@@ -22,7 +23,8 @@ from semdb.errors import DatabaseError, UsageError
 SHARED = {"models": "digest", "cameras": "digest", "categories": "name"}
 ORDER = ("maps", "recordings", "keyframes", "objects")  # what else hangs from, each from the one before
 # logs, and what links two keyframes, which goes when both are there
-NOT_COPIED = ("queries", "keyframe_changes", "pose_operations", "pose_revisions", "loop_closures")
+LANDMARKS = ("landmarks", "landmark_sightings", "landmark_views", "landmark_relations", "landmark_merges")
+NOT_COPIED = ("queries", "keyframe_changes", "pose_operations", "pose_revisions", "loop_closures", *LANDMARKS)
 CHUNK = 16  # keyframes that are read at a time
 Progress = Callable[[int, int], None]
 
@@ -56,6 +58,10 @@ def copy_map(source: Engine, map_id: int, target: Engine, name: str, *, progress
     for table in _hanging_from("maps"):
         if table.name not in ("recordings", *NOT_COPIED):
             _copy_rows(copy, table, "map_id", map_id)
+    used = select(tables.landmarks.c.category_id).where(tables.landmarks.c.map_id == map_id)
+    names = _rows(source, select(tables.categories.c.id).where(tables.categories.c.id.in_(used)))
+    known = retry.write(target, lambda connection: _categories(copy, connection, names))
+    copy_landmarks(source, map_id, target, copy.ids["maps"][map_id], known)
     _keep_current(source, map_id, target, copy.ids["maps"][map_id])
     return copy.done
 
@@ -70,6 +76,15 @@ def _keep_current(source: Engine, map_id: int, target: Engine, target_id: int) -
         connection.execute(tables.refinements.update().where(*same).values(map_state=after))
 
     retry.write(target, work)
+
+
+def _categories(copy: _Copy, connection: Connection, rows: Sequence[Mapping[str, Any]]) -> dict[int, int]:
+    """The ids of classes in the target by those in the source."""
+    known = copy.ids.setdefault("categories", {})
+    for row in rows:
+        if int(row["id"]) not in known:
+            known[int(row["id"])] = _shared(copy, connection, tables.categories, int(row["id"]))
+    return known
 
 
 def _hanging_from(parent: str) -> list[Table]:
@@ -195,6 +210,7 @@ def _copy_keyframes(copy: _Copy, rows: Sequence[dict[str, Any]]) -> None:
     of_objects = {
         table: _by_parent(copy.source, table, _reference(table, "objects"), object_ids)
         for table in _hanging_from("objects")
+        if table.name not in NOT_COPIED
     }
     for row in rows:
         _copy_keyframe(copy, row, children, of_objects)

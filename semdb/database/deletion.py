@@ -20,6 +20,8 @@ from semdb.database.tables import (
     ingest_items,
     keyframe_changes,
     keyframes,
+    landmark_merges,
+    landmarks,
     map_models,
     maps,
     planned_links,
@@ -114,6 +116,8 @@ def delete_map(engine: Engine, map_id: int, progress: Progress | None = None) ->
     recording_ids = retry.read(engine, lambda c: list(c.execute(query).scalars()))
     deleted = sum(delete_recording(engine, recording_id, progress).keyframes for recording_id in recording_ids)
     _delete_rows(engine, keyframe_changes.c.map_id, map_id, keyframe_changes.c.id)
+    for table, rank in ((landmarks, landmarks.c.id), (landmark_merges, landmark_merges.c.landmark_id)):
+        _delete_rows(engine, table.c.map_id, map_id, rank)
     _delete_rows(engine, queries.c.map_id, map_id, queries.c.created_at)
     retry.write(engine, lambda c: c.execute(delete(maps).where(maps.c.id == map_id)))
     return Deleted(recordings=len(recording_ids), keyframes=deleted)

@@ -146,6 +146,12 @@ def replace_refinement(
         return retry.write(engine, work)  # another one made the row of the step between the two statements
 
 
+def forget(engine: Engine, map_id: int, kind: str) -> None:
+    """Makes a step be computed again, whatever its map holds; its rows stay until then."""
+    key = (refinements.c.map_id == map_id) & (refinements.c.kind == kind)
+    retry.write(engine, lambda connection: connection.execute(update(refinements).where(key).values(map_state="")))
+
+
 def iter_objects(
     engine: Engine, map_id: int, progress: Progress | None = None, bad: Bad | None = None
 ) -> Iterator[MapObject]:

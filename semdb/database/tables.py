@@ -118,6 +118,11 @@ def _ref(name: str, target: str, *, cascade: bool = True, nullable: bool = False
     return Column(name, Id, foreign_key, nullable=nullable, autoincrement=False, **options)
 
 
+def _maybe(name: str, target: str) -> Column[int]:
+    """What a row refers to while it is there."""
+    return Column(name, Id, ForeignKey(target, ondelete="SET NULL"), autoincrement=False, index=True)
+
+
 def _time(name: str) -> Column[Any]:
     return Column(name, _Moment, nullable=False, server_default=func.current_timestamp())
 
@@ -409,4 +414,68 @@ pose_revisions = _table(
     *_pose("before_"),
     *_pose("after_"),
     _time("changed_at"),
+)
+
+map_gravity = _table(
+    "map_gravity",
+    _ref("map_id", "maps.id", primary_key=True),
+    *(Column(f"up_{axis}", Double, nullable=False) for axis in "xyz"),
+    Column("up_certainty", Double, nullable=False),
+    Column("floor", Double),
+    Column("floor_certainty", Double, nullable=False),
+    Column("given", Integer, nullable=False),
+)
+
+COVARIANCE_COLUMNS = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
+
+landmarks = _table(
+    "landmarks",
+    _id(),
+    _ref("map_id", "maps.id"),
+    _ref("category_id", "categories.id", cascade=False, index=True),
+    Column("probability", Double, nullable=False),
+    Column("evidence", LongText, nullable=False),
+    *(Column(name, Double, nullable=False) for name in ("x", "y", "z", *COVARIANCE_COLUMNS)),
+    *(Column(name, Double, nullable=False) for name in ("size_x", "size_y", "size_z", "yaw")),
+    *(Column(name, Integer, nullable=False) for name in ("sightings", "keyframes", "missed", "seen_through")),
+    Column("state", String(16), nullable=False),
+    _maybe("first_keyframe_id", "keyframes.id"),
+    _maybe("last_keyframe_id", "keyframes.id"),
+    Column("first_seen_ns", BigInteger),
+    Column("last_seen_ns", BigInteger),
+    Column("appearance", Blob),
+    Index(None, "map_id", "category_id"),
+)
+
+landmark_sightings = _table(
+    "landmark_sightings",
+    _ref("object_id", "objects.id", primary_key=True),
+    _ref("landmark_id", "landmarks.id", index=True),
+    Column("coverage", Double, nullable=False),
+    Column("visibility", Double, nullable=False),
+)
+
+landmark_views = _table(
+    "landmark_views",
+    _ref("landmark_id", "landmarks.id", primary_key=True),
+    Column("place", Integer, primary_key=True, autoincrement=False),
+    _ref("object_id", "objects.id", index=True),
+    Column("quality", Double, nullable=False),
+    Column("distance", Double, nullable=False),
+)
+
+landmark_relations = _table(
+    "landmark_relations",
+    _ref("landmark_id", "landmarks.id", primary_key=True),
+    Column("kind", String(16), primary_key=True),
+    _ref("other_landmark_id", "landmarks.id", primary_key=True),
+    Column("score", Double, nullable=False),
+    Index(None, "other_landmark_id", "kind"),
+)
+
+landmark_merges = _table(
+    "landmark_merges",
+    Column("landmark_id", Id, primary_key=True, autoincrement=False),
+    _ref("map_id", "maps.id", index=True),
+    Column("merged_into", Id, nullable=False),
 )

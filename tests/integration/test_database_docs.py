@@ -15,7 +15,7 @@ from semdb.database.readonly import run_readonly
 from semdb.database.store import Store
 from semdb.settings import Settings
 from semdb.types import Localization, Verdict
-from tests.database_samples import MODELS, description, fill, plan, pose, record
+from tests.database_samples import MODELS, description, fill, plan, pose, record, stored_landmarks
 from tests.servers import TestServer
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -55,6 +55,7 @@ def _populate(store: Store) -> None:
     store.log_query(map_id, "query.png", found)
     store.log_query(map_id, "blank.png", lost)
     assert len(ids) == 5
+    assert len(stored_landmarks(store, map_id)) == 7
 
 
 def test_there_are_enough_questions() -> None:

@@ -16,6 +16,7 @@ from sqlalchemy import Engine, inspect, text
 import semdb.migrations
 from semdb.database import schema
 from semdb.database.engine import make_engine
+from semdb.database.landmark_rows import load_gravity
 from semdb.database.links import list_links
 from semdb.database.pose_records import PoseSource, World
 from semdb.database.pose_sources import recording_poses
@@ -23,7 +24,7 @@ from semdb.database.records import ChangeKind
 from semdb.database.store import Store, open_store
 from semdb.database.tables import metadata
 from semdb.errors import SchemaError
-from tests.database_samples import description, fill
+from tests.database_samples import description, fill, stored_landmarks
 from tests.integration.comparison import FRAMES, assert_same
 
 VIEWS = {
@@ -33,6 +34,8 @@ VIEWS = {
     "covisible_objects",
     "keypoint_counts",
     "keyframe_links",
+    "landmark_list",
+    "landmark_relations_named",
 }
 
 
@@ -162,3 +165,19 @@ def test_processes_that_make_the_same_file_do_not_disturb_each_other(tmp_path: P
     for item in stores:
         assert isinstance(item, Store)
         item.close()
+
+
+def test_a_map_of_before_gets_landmarks(engine: Engine, empty_url: str) -> None:
+    schema.upgrade(engine)
+    with open_store(empty_url) as store:
+        map_id, _, ids = fill(store)
+        stored_landmarks(store, map_id)
+    schema.downgrade(engine, "0008")
+    assert "landmarks" not in inspect(engine).get_table_names()
+    assert "landmark_list" not in inspect(engine).get_view_names()
+    schema.upgrade(engine)
+    with open_store(empty_url) as store:
+        for keyframe, index in zip(store.load_keyframes(ids), FRAMES, strict=True):
+            assert_same(keyframe, description(index), index)
+        assert load_gravity(engine, map_id) is None
+        assert len(stored_landmarks(store, map_id)) == 7

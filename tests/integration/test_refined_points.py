@@ -31,6 +31,9 @@ FRAMES = 6
 CATEGORIES = ["chair", "cup", "tv"]
 
 
+STEPS = ("classes", "points", "landmarks")
+
+
 def pose_of(frame: float) -> FloatArray:
     return pose_from(so3_exp([0, 0.06 * (frame - 3), 0]), [0.25 * (frame - 3), 0.1 * (frame % 2), 0.0])
 
@@ -149,12 +152,12 @@ def test_stale_points_are_not_used(store: Store, views: tuple[list[KeyframeRecor
     after = localizer.localize(query)  # the one that is open notices, and so does a new one
     assert after.refinements == {"points": "stale"}
     assert after.inliers < before.inliers
-    assert refinements_of(store.refinements()) == {info.id: {"classes": "stale", "points": "stale"}}
+    assert refinements_of(store.refinements()) == {info.id: dict.fromkeys(STEPS, "stale")}
     fresh = make_localizer(store, info, "sql", say=said.append)
     assert "not used: run semdb refine" in said[-1]
     assert fresh.localize(query).inliers == after.inliers
     refine_map(store, info)
-    assert refinements_of(store.refinements()) == {info.id: {"classes": "current", "points": "current"}}
+    assert refinements_of(store.refinements()) == {info.id: dict.fromkeys(STEPS, "current")}
     ids, _ = store.poses(info.id)
     store.delete_keyframes(ids[:1])  # its row goes with it
     assert set(by_frame(store, info)) == set(range(1, FRAMES))

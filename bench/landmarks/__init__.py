@@ -1,0 +1,1 @@
+"""Landmarks of rendered rooms against exact instance truth."""

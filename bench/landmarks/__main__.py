@@ -1,0 +1,64 @@
+"""Landmarks of rendered rooms against exact instance truth.
+
+``python -m bench.landmarks [--rooms N] [--first SEED] [--keyframes N] [--json FILE]``. Each room is a map of its own.
+Masks are exact, or 30 % of the objects are missed, 15 % misnamed, 30 % of the masks cut, with a pose noise of 1 cm and
+0.5 degrees (root mean square); both with exact depth and with that of a noisy sensor. A thing counts when the detector
+found it in at least three keyframes; its box is that of the surface that at least two keyframes see, along its own
+axes, with sides of 3 cm at least. Needs no model file. Seeds below 400 were tuned on; the default is judged on others.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import asdict
+from pathlib import Path
+
+from bench.landmarks.rooms import (
+    EXACT,
+    NOISY,
+    SPOILED,
+    SPOILED_NOISY,
+    class_numbers,
+    render_room,
+    seen_keyframes,
+    true_things,
+)
+from bench.landmarks.scores import HEADER, Score, score, summed
+from semdb.landmarks.build import find_landmarks
+
+SETTINGS = {"exact": EXACT, "mistakes": SPOILED, "exact, noisy depth": NOISY, "mistakes, noisy depth": SPOILED_NOISY}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--rooms", type=int, default=10)
+    parser.add_argument("--first", type=int, default=400)
+    parser.add_argument("--keyframes", type=int, default=24)
+    parser.add_argument("--width", type=int, default=640)
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    scores: dict[str, list[Score]] = {name: [] for name in SETTINGS}
+    seconds = 0.0
+    for seed in range(given.first, given.first + given.rooms):
+        room = render_room(seed, given.keyframes, given.width)
+        numbers, things = class_numbers([room]), true_things(room)
+        for name, mistakes in SETTINGS.items():
+            keyframes, labels = seen_keyframes(room, numbers, mistakes)
+            start = time.perf_counter()
+            found = find_landmarks(keyframes, len(numbers))
+            seconds += time.perf_counter() - start
+            scores[name].append(score(found.landmarks, labels, things, list(numbers)))
+        print(f"room {seed}: {scores['exact'][-1].things} things", flush=True)
+    print(f"{given.rooms} rooms of {given.keyframes} keyframes, {seconds / given.rooms / len(SETTINGS):.2f} s each")
+    print(f"{'':24}{HEADER}")
+    for name, of_rooms in scores.items():
+        print(f"{name:24}{summed(of_rooms).line}")
+    if given.json is not None:
+        values = {name: [asdict(one) for one in of_rooms] for name, of_rooms in scores.items()}
+        given.json.write_text(json.dumps(values, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

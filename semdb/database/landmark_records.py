@@ -1,0 +1,105 @@
+"""Values of the tables of landmarks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from semdb.types import Camera, FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class GravityRow:
+    """Which way is up in a map (unit vector), and where its floor is: points x with ``up @ x == floor``."""
+
+    up: tuple[float, float, float]
+    up_certainty: float
+    floor: float | None
+    floor_certainty: float
+    given: bool
+
+
+@dataclass(frozen=True, slots=True)
+class LandmarkSighting:
+    """An object that shows a landmark."""
+
+    object_id: int
+    coverage: float
+    visibility: float
+
+
+@dataclass(frozen=True, slots=True)
+class LandmarkView:
+    """An object that shows a landmark well; `distance` of the camera in metres."""
+
+    object_id: int
+    quality: float
+    distance: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LandmarkRow:
+    """A landmark as it is stored, but for its id."""
+
+    category: str
+    probability: float
+    evidence: Mapping[str, float]
+    position: tuple[float, float, float]
+    covariance: FloatArray  # [3, 3]
+    size: tuple[float, float, float]
+    yaw: float
+    keyframes: int
+    missed: int
+    seen_through: int
+    state: str
+    first_keyframe_id: int
+    last_keyframe_id: int
+    first_seen_ns: int | None
+    last_seen_ns: int | None
+    sightings: tuple[LandmarkSighting, ...]
+    views: tuple[LandmarkView, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class LandmarkRelation:
+    """By numbers of landmarks in a list."""
+
+    one: int
+    kind: str
+    other: int
+    score: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LandmarkSet:
+    """All that is stored of the landmarks of a map."""
+
+    landmarks: tuple[LandmarkRow, ...]
+    relations: tuple[LandmarkRelation, ...]
+    gravity: GravityRow
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframeObject:
+    """An object of a keyframe with its mask, as stored."""
+
+    id: int
+    category: str
+    score: float
+    mask: bytes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframeDepth:
+    """What landmarks are made of: a keyframe's pose, depth file (as recorded, None without) and objects by ordinal."""
+
+    id: int
+    recording: str
+    frame_index: int
+    timestamp_ns: int | None
+    camera: Camera
+    world_from_camera: FloatArray  # [4, 4]
+    depth: bytes | None
+    depth_scale: float | None
+    depth_registration: str
+    objects: tuple[KeyframeObject, ...]

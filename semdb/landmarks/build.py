@@ -1,0 +1,266 @@
+"""All of it: keyframes with masks and depth to landmarks.
+
+A function of the keyframes in their order (recording's name, frame) and of nothing else. Objects are compared by that
+order, so the result does not depend on when, or by whom, they were stored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from semdb.landmarks.boxes import upright_box
+from semdb.landmarks.clustering import UNIT, clusters
+from semdb.landmarks.evidence import fuse, name_probabilities
+from semdb.landmarks.gravity import Gravity, estimate_gravity
+from semdb.landmarks.lift import LiftedKeyframe
+from semdb.landmarks.links import find_links, sighting_table, weights
+from semdb.landmarks.options import LandmarkOptions
+from semdb.landmarks.register import corrected_poses
+from semdb.landmarks.shape import thing_points
+from semdb.landmarks.values import BestView, Landmark, Landmarks, LandmarkState, Member
+from semdb.landmarks.visibility import IN_VIEW, THROUGH, VISIBLE, Sightings, Views, collect, look
+from semdb.types import FloatArray, Int64Array
+
+Progress = Callable[[int, int], None]
+EXPECTED = 0.5  # share of a thing's points in sight: the detector should have seen it
+SEEN_THROUGH = 0.6  # share of a thing's points that are looked through
+MOST_VIEWS = 3
+FULL_SIZE = 0.02  # of the image: a thing this large is large enough to be looked at
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SeenKeyframe:
+    """A keyframe with what the detector called its objects, by ordinal, and when it was taken."""
+
+    lifted: LiftedKeyframe
+    category: Int64Array  # [objects] number of the class
+    score: FloatArray  # [objects]
+    recording: int  # number of the recording, in the order of the names
+    time_ns: int | None = None  # of the clock on the wall, where the recording has such times
+
+
+def find_landmarks(
+    keyframes: Sequence[SeenKeyframe],
+    classes: int,
+    confusion: FloatArray | None = None,
+    up: FloatArray | None = None,
+    options: LandmarkOptions | None = None,
+    progress: Progress | None = None,
+) -> Landmarks:
+    """The landmarks of a map, of its keyframes by recording's name and frame.
+
+    `confusion` ``[classes, classes]``: shares of what goes by another name (see `evidence.name_probabilities`). `up`
+    ``[3]``: which way is up, where that is known.
+    """
+    options = options or LandmarkOptions()
+    lifted = [frame.lifted for frame in keyframes]
+    poses = corrected_poses(lifted, options.register)
+    moved = [float(np.linalg.norm(p[:3, 3] - f.world_from_camera[:3, 3])) for p, f in zip(poses, lifted, strict=True)]
+    lifted = [replace(frame, world_from_camera=pose) for frame, pose in zip(lifted, poses, strict=True)]
+    gravity = estimate_gravity(lifted, up)
+    sightings = collect(lifted)
+    views = look(lifted, sightings, options.see, progress)
+    names = name_probabilities(classes, confusion)
+    cluster = associate(keyframes, lifted, sightings, views, names, options)
+    found = _Assembly(keyframes, lifted, sightings, views, cluster, names, gravity, options)
+    landmarks = [found.landmark(root) for root in np.unique(cluster).tolist()]
+    objects = sum(len(frame.category) for frame in keyframes)
+    placed = sum(len(thing.members) for thing in landmarks)
+    return Landmarks(
+        tuple(sorted(landmarks, key=lambda thing: thing.key)),
+        gravity,
+        float(np.median(moved)) if moved else 0.0,
+        objects - placed,
+    )
+
+
+def associate(
+    keyframes: Sequence[SeenKeyframe],
+    lifted: Sequence[LiftedKeyframe],
+    sightings: Sightings,
+    views: Views,
+    names: FloatArray,
+    options: LandmarkOptions,
+) -> Int64Array:
+    """The thing of each sighting, int64 ``[n]``: the number of its first sighting."""
+    links = find_links(lifted, sightings, views)
+    first = [_objects_of(keyframes[k], int(label) - 1)[0] for k, label in zip(*_place(sightings), strict=True)]
+    category = np.array(
+        [keyframes[k].category[o] for k, o in zip(sightings.keyframe.tolist(), first, strict=True)], np.int64
+    )
+    weight = weights(links, category, names, options.link)
+    a, b, w = [links.a], [links.b], [weight]
+    offset, number = sighting_table(lifted, sightings)
+    for k, frame in enumerate(lifted):
+        one, other = np.nonzero(np.triu(frame.beside, 1))
+        one, other = number[offset[k] + one], number[offset[k] + other]
+        there = (one >= 0) & (other >= 0)
+        a.append(one[there])
+        b.append(other[there])
+        w.append(np.full(np.count_nonzero(there), round(options.link.apart * UNIT), np.int64))
+    return clusters(len(sightings), np.concatenate(a), np.concatenate(b), np.concatenate(w))
+
+
+def _place(sightings: Sightings) -> tuple[list[int], list[int]]:
+    return sightings.keyframe.tolist(), sightings.label.tolist()
+
+
+def _objects_of(frame: SeenKeyframe, sighting: int) -> Int64Array:
+    """Ordinals of the objects that are one sighting."""
+    return np.flatnonzero(frame.lifted.sighting_of == sighting)
+
+
+class _Assembly:
+    """Things of their sightings."""
+
+    def __init__(
+        self,
+        keyframes: Sequence[SeenKeyframe],
+        lifted: Sequence[LiftedKeyframe],
+        sightings: Sightings,
+        views: Views,
+        cluster: Int64Array,
+        names: FloatArray,
+        gravity: Gravity,
+        options: LandmarkOptions,
+    ) -> None:
+        self._keyframes, self._lifted, self._sightings = keyframes, lifted, sightings
+        self._names, self._gravity, self._options = names, gravity, options
+        order = np.argsort(cluster, kind="stable")
+        roots, start = np.unique(cluster[order], return_index=True)
+        ends = [*start[1:].tolist(), len(order)][: len(roots)]
+        self._rows = {int(r): order[s:e] for r, s, e in zip(roots, start, ends, strict=True)}
+        self._views = views
+        self._first_view = np.searchsorted(views.sighting, np.arange(len(sightings) + 1))
+        own = np.zeros(len(views.sighting), np.int64)  # visible points in a mask of the same thing
+        offset, number = sighting_table(lifted, sightings)
+        labelled = views.overlap_label > 0
+        pair = views.overlap_pair[labelled]
+        other = number[offset[views.keyframe[pair]] + views.overlap_label[labelled] - 1]
+        same = (other >= 0) & (cluster[np.maximum(other, 0)] == cluster[views.sighting[pair]])
+        np.add.at(own, pair[same], views.overlap[labelled][same, 0])
+        self._own = own
+
+    def landmark(self, root: int) -> Landmark:
+        rows, options = self._rows[root], self._options
+        members: dict[int, list[int]] = {}
+        for row in rows.tolist():
+            members.setdefault(int(self._sightings.keyframe[row]), []).append(int(self._sightings.label[row]) - 1)
+        points = thing_points(self._lifted, members, options.see, options.shape)
+        box = upright_box(points, self._gravity.up, options.shape.trim)
+        objects = [(k, int(o)) for k, s in sorted(members.items()) for one in sorted(s) for o in self._ordinals(k, one)]
+        objects.sort()
+        category = np.array([self._keyframes[k].category[o] for k, o in objects], np.int64)
+        score = np.array([self._keyframes[k].score[o] for k, o in objects], np.float64)
+        evidence = fuse(category, score, self._names)
+        best = int(np.argmax(np.round(evidence, 9)))
+        seen = self._seen(rows)
+        shares = {
+            k: (min(1.0, own / max(visible, 1)), min(1.0, visible / max(total, 1)))
+            for k, (total, _, visible, _, own) in seen.items()
+        }
+        listed = tuple(Member(k, o, *map(_rounded, shares.get(k, (1.0, 1.0)))) for k, o in objects)
+        missed, through = self._elsewhere(seen, members)
+        times = sorted(members)
+        state = self._state(len(members), len(missed), through, times[-1])
+        return Landmark(
+            members=listed,
+            category=best,
+            probability=float(evidence[best]),
+            evidence=evidence,
+            box=box,
+            covariance=self._covariance(rows, box.size),
+            keyframes=len(members),
+            missed=len(missed),
+            seen_through=len(through),
+            first=times[0],
+            last=times[-1],
+            state=state,
+            views=self._best_views(listed, box.centre),
+        )
+
+    def _ordinals(self, keyframe: int, sighting: int) -> Int64Array:
+        return _objects_of(self._keyframes[keyframe], sighting)
+
+    def _seen(self, rows: Int64Array) -> dict[int, tuple[int, int, int, int, int]]:
+        """Of each keyframe: points looked up, in view, visible, seen through, and in a mask of the thing.
+
+        A sighting says nothing of its own keyframe, unless it is the only one.
+        """
+        found: dict[int, list[int]] = {}
+        views = self._views
+        for row in rows.tolist():
+            span = slice(self._first_view[row], self._first_view[row + 1])
+            total, home = int(self._sightings.count[row]), int(self._sightings.keyframe[row])
+            for keyframe, seen, own in zip(
+                views.keyframe[span].tolist(), views.seen[span].tolist(), self._own[span].tolist(), strict=True
+            ):
+                if keyframe == home and len(rows) > 1:
+                    continue
+                sums = found.setdefault(keyframe, [0, 0, 0, 0, 0])
+                for k, value in enumerate((total, seen[IN_VIEW], seen[VISIBLE], seen[THROUGH], own)):
+                    sums[k] += value
+        return {k: (s[0], s[1], s[2], s[3], s[4]) for k, s in found.items()}
+
+    def _elsewhere(
+        self, seen: dict[int, tuple[int, int, int, int, int]], members: dict[int, list[int]]
+    ) -> tuple[list[int], list[int]]:
+        """Keyframes that should show the thing and do not, and those that see through its place."""
+        missed, through = [], []
+        for keyframe, (total, in_view, visible, seen_through, _) in sorted(seen.items()):
+            if keyframe in members:
+                continue
+            if visible >= EXPECTED * total:
+                missed.append(keyframe)
+            elif in_view >= EXPECTED * total and seen_through >= SEEN_THROUGH * max(in_view, 1):
+                through.append(keyframe)
+        return missed, through
+
+    def _state(self, keyframes: int, missed: int, through: Sequence[int], last: int) -> LandmarkState:
+        options = self._options
+        later = [k for k in through if self._is_later(k, last)]
+        if len(later) >= options.gone:
+            return LandmarkState.GONE
+        if keyframes >= options.confirmed and keyframes >= options.confirmed_share * (keyframes + missed):
+            return LandmarkState.CONFIRMED
+        return LandmarkState.TENTATIVE
+
+    def _is_later(self, keyframe: int, other: int) -> bool:
+        """Whether a keyframe is known to be later than another one."""
+        one, two = self._keyframes[keyframe], self._keyframes[other]
+        if one.recording == two.recording:
+            return keyframe > other
+        return one.time_ns is not None and two.time_ns is not None and one.time_ns > two.time_ns
+
+    def _covariance(self, rows: Int64Array, size: FloatArray) -> FloatArray:
+        """Of the box's centre: how the middles of the sightings scatter, and what a pose is good for."""
+        count = len(rows)
+        centres = np.array([self._sightings.points[r, : self._sightings.count[r]].mean(axis=0) for r in rows])
+        noise = np.eye(3) * self._options.register.position_sigma_m**2
+        least = np.diag((0.02 * size) ** 2) + noise / 4
+        if count < 3:
+            return np.asarray(np.eye(3) * (0.1 * float(size.max())) ** 2 + noise, np.float64)
+        apart = centres - centres.mean(axis=0)
+        return np.asarray((apart.T @ apart / (count - 1) + noise) / count + least, np.float64)
+
+    def _best_views(self, members: Sequence[Member], centre: FloatArray) -> tuple[BestView, ...]:
+        found: dict[int, BestView] = {}
+        for member in members:
+            frame, lifted = self._keyframes[member.keyframe], self._lifted[member.keyframe]
+            sighting = int(lifted.sighting_of[member.ordinal])
+            size = lifted.areas[sighting] / (lifted.camera.width * lifted.camera.height)
+            quality = member.visibility * min(1.0, size / FULL_SIZE) ** 0.5 * (0.5 if lifted.cut[sighting] else 1.0)
+            quality *= 0.5 + 0.5 * float(frame.score[member.ordinal])
+            distance = float(np.linalg.norm(centre - lifted.world_from_camera[:3, 3]))
+            view = BestView(member.keyframe, member.ordinal, _rounded(quality), _rounded(distance))
+            known = found.get(member.keyframe)
+            if known is None or view.quality > known.quality:
+                found[member.keyframe] = view
+        return tuple(sorted(found.values(), key=lambda v: (-v.quality, v.keyframe, v.ordinal))[:MOST_VIEWS])
+
+
+def _rounded(value: float) -> float:
+    return round(float(value), 6)

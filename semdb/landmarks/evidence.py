@@ -1,0 +1,42 @@
+"""What class a thing is: every sighting is evidence, as strong as the detector is sure and is known to be right."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from semdb.types import FloatArray, Int64Array
+
+FLOOR = 0.02  # of the probability of any name, whatever the thing is
+SURE = 0.9  # share of right names of a class whose confusions nobody knows
+
+
+def name_probabilities(classes: int, confusion: FloatArray | None = None) -> FloatArray:
+    """``[true class, name]``: how likely the detector gives a thing of a class a name. Rows sum to one.
+
+    `confusion` ``[classes, classes]`` is the share of what is found at the place of a class that goes by another name
+    (`semdb refine`, step classes). Where nearly all of what goes by a rare name is of another class, that share is
+    large in one direction alone: the smaller of the two directions is what the detector does.
+    """
+    mixed = np.zeros((classes, classes)) if confusion is None else np.minimum(confusion, confusion.T)
+    np.fill_diagonal(mixed, 0.0)
+    right = np.where(mixed.sum(axis=1) > 0, np.maximum(1 - mixed.sum(axis=1), 0.5), SURE)
+    others = mixed.copy()
+    total = others.sum(axis=1, keepdims=True)
+    others = np.where(total > 0, others / np.where(total > 0, total, 1) * (1 - right[:, None]), 0.0)
+    found = others + np.diag(right)
+    found = (1 - FLOOR) * found / found.sum(axis=1, keepdims=True) + FLOOR / max(classes, 1)
+    return np.asarray(found / found.sum(axis=1, keepdims=True), np.float64)
+
+
+def fuse(category: Int64Array, score: FloatArray, names: FloatArray) -> FloatArray:
+    """Probabilities ``[classes]`` of what a thing is, of the names ``[k]`` and scores ``[k]`` that it was seen under.
+
+    A name of score s says with weight s that it was given by `name_probabilities`, and nothing with weight 1 - s.
+    Numbers are rounded, so that the same evidence in another order is the same to the last bit.
+    """
+    classes = names.shape[1]
+    certain = np.clip(score, 0.05, 0.99)[:, None]
+    likelihood = np.log(certain * names[:, category].T + (1 - certain) / max(classes, 1))
+    total = np.rint(likelihood * 1e9).astype(np.int64).sum(axis=0) / 1e9
+    found = np.exp(total - total.max())
+    return np.asarray(found / found.sum(), np.float64)

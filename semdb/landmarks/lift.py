@@ -1,0 +1,189 @@
+"""Masks and depth of one keyframe to sightings: points in the map, and a small picture of who stands where."""
+
+# compiled functions take what numba infers
+# mypy: disable-error-code="no-untyped-call"
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from semdb.geometry import pixels_to_normalized
+from semdb.landmarks.options import LiftOptions, SeeOptions
+from semdb.perception.lifting import lift as lift_points
+from semdb.types import BoolArray, Camera, Float32Array, FloatArray, Int64Array
+
+Labels = npt.NDArray[np.int16]
+_MOST_LABELS = 32_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SeenObject:
+    """An object of a keyframe as the detector gave it."""
+
+    category: int  # number of the class
+    score: float
+    mask: BoolArray  # [H, W]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LiftedKeyframe:
+    """What one keyframe says: its sightings, and its depth and masks reduced to a grid.
+
+    A sighting is one mask, or several masks of one keyframe that are the same but for their names. Label 0 of the grid
+    is the background, label k + 1 sighting k; where masks overlap the smallest one is seen.
+    """
+
+    camera: Camera
+    world_from_camera: FloatArray  # [4, 4]
+    sighting_of: Int64Array  # [objects] sighting of each object, by ordinal
+    points: tuple[Float32Array, ...]  # of each sighting [k, 3] camera frame, away from edges; empty: it has no place
+    outline: tuple[Float32Array, ...]  # of each sighting [j, 3] camera frame: all of the mask, its rim at inner depth
+    areas: Int64Array  # [sightings] pixels
+    beside: BoolArray  # [sightings, sightings] both seen, and apart: they are two things
+    cut: BoolArray  # [sightings] touches the rim of the image
+    grid_depth: Float32Array  # [h, w] metres, 0 where unknown
+    grid_owner: Labels  # [h, w]
+    step: int  # pixels from one cell of the grid to the next; the first is at pixel ``step // 2``
+
+
+def lift_keyframe(
+    camera: Camera,
+    world_from_camera: FloatArray,
+    depth: Float32Array | None,
+    objects: Sequence[SeenObject],
+    lift: LiftOptions | None = None,
+    see: SeeOptions | None = None,
+) -> LiftedKeyframe:
+    """Lifts the `objects` of one keyframe, by ordinal; `depth` ``[H, W]`` metres, not finite or not positive: none.
+
+    Without depth nothing has a place.
+    """
+    from semdb.landmarks.kernels import inner_pixels, rim_pixels
+
+    lift, see = lift or LiftOptions(), see or SeeOptions()
+    shape = (camera.height, camera.width)
+    known = np.zeros(shape, np.float32) if depth is None else np.where(np.isfinite(depth) & (depth > 0), depth, 0)
+    known = np.ascontiguousarray(known, np.float32)
+    sighting_of, first = same_masks([thing.mask for thing in objects[:_MOST_LABELS]], lift.same_mask)
+    masks = [objects[k].mask for k in first]
+    areas = np.array([np.count_nonzero(mask) for mask in masks], np.int64)
+    owner = np.zeros(shape, np.int16)
+    for k in sorted(range(len(masks)), key=lambda k: (-areas[k], -k)):
+        owner[masks[k]] = k + 1
+    buffers = (np.empty(owner.size, np.int64), np.empty(owner.size, np.int64), np.empty(owner.size, np.float32))
+    state = np.zeros(owner.size, np.uint8)
+    points, outline, cut = [], [], np.zeros(len(masks), np.bool_)
+    for k, mask in enumerate(masks):
+        box = bounds(mask)
+        cut[k] = box[0] <= 1 or box[1] <= 1 or box[2] >= shape[1] - 1 or box[3] >= shape[0] - 1
+        border = lift.border if areas[k] >= lift.thin_area else lift.thin_border
+        limits = (lift.jump_m, lift.jump_share)
+        number: int = inner_pixels(known, owner, k + 1, border, *limits, box, buffers[0])
+        while border > 0 and number < 4 * lift.fewest:
+            border -= 1
+            number = inner_pixels(known, owner, k + 1, border, *limits, box, buffers[0])
+        if number < lift.fewest:
+            points.append(np.empty((0, 3), np.float32))
+            outline.append(np.empty((0, 3), np.float32))
+            continue
+        inner, values = buffers[0][:number], known.ravel()[buffers[0][:number]]
+        points.append(_points(camera, inner, values, lift.samples))
+        rest = rim_pixels(known, owner, k + 1, border + 2, inner, number, box, state, buffers[1], buffers[2])
+        edge = _points(camera, buffers[1][:rest], buffers[2][:rest], lift.outline // 2, known, owner == k + 1)
+        body = _points(camera, inner, values, lift.outline // 2, known, owner == k + 1)
+        outline.append(np.concatenate([body, edge]))
+    step = max(1, shape[1] // see.grid)
+    half = step // 2
+    return LiftedKeyframe(
+        camera=camera,
+        world_from_camera=np.asarray(world_from_camera, np.float64),
+        sighting_of=sighting_of,
+        points=tuple(points),
+        outline=tuple(outline),
+        areas=areas,
+        beside=apart(masks, areas),
+        cut=cut,
+        grid_depth=np.ascontiguousarray(known[half::step, half::step]),
+        grid_owner=np.ascontiguousarray(owner[half::step, half::step]),
+        step=step,
+    )
+
+
+def _points(
+    camera: Camera,
+    pixels: Int64Array,
+    inner: Float32Array,
+    most: int,
+    depth: Float32Array | None = None,
+    mask: BoolArray | None = None,
+) -> Float32Array:
+    """Camera-frame points ``[k, 3]`` of flat `pixels` ``[n]``: at most `most`, evenly taken.
+
+    Their depth is that of an inner pixel nearby, `inner` ``[n]``; or, with `depth` and `mask` ``[H, W]``, that of a
+    plane fitted to the mask's pixels around, or their own, where that is as near as the thing is wide.
+    """
+    wanted = min(len(pixels), most)
+    taken = (np.arange(wanted) * len(pixels) + len(pixels) // 2) // max(wanted, 1)
+    v, u = np.divmod(pixels[taken], camera.width)
+    z = inner[taken].astype(np.float64)
+    if depth is not None and mask is not None and wanted:
+        own = depth[v, u].astype(np.float64)
+        reach = 0.05 + max(np.ptp(u) / camera.fx, np.ptp(v) / camera.fy) * np.median(z)
+        z = np.where((own > 0) & (np.abs(own - z) < reach), own, z)
+        fitted = lift_points(camera, np.where(mask, depth, np.nan), np.column_stack([u, v]).astype(np.float32))[:, 2]
+        z = np.where(np.isfinite(fitted) & (np.abs(fitted - z) < 0.05 + 0.02 * z), fitted, z)
+    rays = pixels_to_normalized(camera, np.column_stack([u, v]))
+    found = np.column_stack([rays * z[:, None], z])
+    return found[np.isfinite(found).all(axis=1)].astype(np.float32)
+
+
+def bounds(mask: BoolArray) -> Int64Array:
+    """u0, v0, u1, v1 (ends beyond) of a mask; zeros of an empty one."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not len(rows):
+        return np.zeros(4, np.int64)
+    return np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], np.int64)
+
+
+def same_masks(masks: Sequence[BoolArray], least: float) -> tuple[Int64Array, list[int]]:
+    """The sighting of each mask, int64 ``[n]``, and the first mask of each sighting.
+
+    Masks whose intersection over union is at least `least` are one sighting.
+    """
+    boxes = [bounds(mask) for mask in masks]
+    areas = [int(np.count_nonzero(mask)) for mask in masks]
+    first: list[int] = []
+    sighting = np.zeros(len(masks), np.int64)
+    for k in range(len(masks)):
+        for number, other in enumerate(first):
+            if min(areas[k], areas[other]) < least * max(areas[k], areas[other]):
+                continue
+            both = _common(masks[k], masks[other], boxes[k], boxes[other])
+            if both > 0 and both >= least * (areas[k] + areas[other] - both):
+                sighting[k] = number
+                break
+        else:
+            sighting[k] = len(first)
+            first.append(k)
+    return sighting, first
+
+
+def apart(masks: Sequence[BoolArray], areas: Int64Array, most: float = 0.1) -> BoolArray:
+    """Which masks of one keyframe do not overlap by more than the share `most` of the smaller: bool ``[n, n]``."""
+    boxes = [bounds(mask) for mask in masks]
+    found = ~np.eye(len(masks), dtype=np.bool_)
+    for a in range(len(masks)):
+        for b in range(a):
+            both = _common(masks[a], masks[b], boxes[a], boxes[b])
+            found[a, b] = found[b, a] = both <= most * min(areas[a], areas[b])
+    return found
+
+
+def _common(one: BoolArray, other: BoolArray, a: Int64Array, b: Int64Array) -> int:
+    u0, v0, u1, v1 = max(a[0], b[0]), max(a[1], b[1]), min(a[2], b[2]), min(a[3], b[3])
+    if u0 >= u1 or v0 >= v1:
+        return 0
+    return int(np.count_nonzero(one[v0:v1, u0:u1] & other[v0:v1, u0:u1]))

@@ -1,0 +1,78 @@
+"""The points of a thing, from all its sightings, and the box about them."""
+
+# compiled functions take what numba infers
+# mypy: disable-error-code="no-untyped-call"
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from semdb.geometry import invert_pose, transform_points
+from semdb.landmarks.lift import LiftedKeyframe
+from semdb.landmarks.options import SeeOptions, ShapeOptions
+from semdb.types import FloatArray
+
+MOST_VIEWS = 48  # that vote on the points of a thing
+
+
+def thing_points(
+    lifted: Sequence[LiftedKeyframe], members: Mapping[int, Sequence[int]], see: SeeOptions, shape: ShapeOptions
+) -> FloatArray:
+    """Points ``[n, 3]`` (map) of a thing whose sightings are `members`: numbers of sightings by keyframe, ascending.
+
+    A point stays when enough of the keyframes that have a sighting of the thing, and see the point, see it in there:
+    what a mask took of the wall behind is gone. Where next to nothing stays, all points do.
+    """
+    found = [
+        transform_points(lifted[k].world_from_camera, lifted[k].outline[s])
+        for k, numbers in sorted(members.items())
+        for s in sorted(numbers)
+    ]
+    points = thinned(np.concatenate(found), shape.voxel, shape.most_points)
+    visible, inside = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
+    keys = sorted(members)
+    if len(keys) > MOST_VIEWS:
+        keys = [keys[k * len(keys) // MOST_VIEWS] for k in range(MOST_VIEWS)]
+    for key in keys:
+        _vote(lifted[key], members[key], points, see, visible, inside)
+    kept = inside >= np.maximum(shape.kept_share * visible, 1)
+    if np.count_nonzero(kept) < max(8, 0.1 * len(points)):
+        return points
+    return crowded(points[kept])
+
+
+def crowded(points: FloatArray, reach: float = 0.03, fewest: int = 2) -> FloatArray:
+    """`points` ``[n, 3]`` without those that have fewer than `fewest` others within `reach` metres."""
+    tree = cKDTree(points)
+    near = np.asarray(tree.query(points, k=min(fewest + 1, len(points)), distance_upper_bound=reach)[0])
+    kept = np.isfinite(near.reshape(len(points), -1)[:, -1])
+    return points[kept] if np.count_nonzero(kept) >= 0.5 * len(points) else points
+
+
+def _vote(
+    frame: LiftedKeyframe, numbers: Sequence[int], points: FloatArray, see: SeeOptions, visible: object, inside: object
+) -> None:
+    from semdb.landmarks.kernels import vote
+
+    camera = frame.camera
+    mine = np.zeros(len(frame.points) + 1, np.bool_)
+    mine[np.asarray(numbers) + 1] = True
+    distortion = np.array((*camera.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5], np.float64)
+    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], np.float64)
+    limits = np.array([see.near_m, see.near_share, see.through_m, see.through_share, see.silhouette_m])
+    step = float(frame.step)
+    pose = invert_pose(frame.world_from_camera)
+    vote(points, pose, lens, distortion, frame.grid_depth, frame.grid_owner, step, limits, mine, visible, inside)
+
+
+def thinned(points: FloatArray, voxel: float, most: int) -> FloatArray:
+    """One point, the mean, for each cube of side `voxel` that has any, at most `most` of them, evenly taken."""
+    cells = np.floor(points / voxel).astype(np.int64)
+    _, inverse, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    inverse = inverse.ravel()
+    means = np.stack([np.bincount(inverse, points[:, k]) for k in range(3)], axis=1) / counts[:, None]
+    if len(means) > most:
+        means = means[np.arange(most, dtype=np.int64) * len(means) // most]
+    return np.asarray(means, np.float64)

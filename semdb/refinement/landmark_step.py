@@ -1,0 +1,187 @@
+"""Step ``landmarks``: the things that the objects of a map are sightings of, and how they stand to each other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from sqlalchemy import Connection
+
+from semdb.database import landmark_rows
+from semdb.database.codecs import decode_mask
+from semdb.database.landmark_records import (
+    GravityRow,
+    KeyframeDepth,
+    LandmarkRelation,
+    LandmarkRow,
+    LandmarkSet,
+    LandmarkSighting,
+    LandmarkView,
+)
+from semdb.database.store import Store
+from semdb.errors import CodecError, FrameError
+from semdb.landmarks.options import LandmarkOptions
+from semdb.refinement.class_step import placed_objects
+from semdb.refinement.confusion import MILLION, ConfusionOptions, co_detections, confusions
+from semdb.types import Float32Array, FloatArray
+
+CLOCK_NS = 10**17  # times from here on (1973) are of the clock on the wall; smaller ones begin with their recording
+LEAST_EVIDENCE = 0.0005
+REVISION = 1  # of the computation: another one makes what is stored out of date
+
+
+@dataclass(frozen=True, slots=True)
+class LandmarkStep:
+    """Things, and how they stand to each other."""
+
+    options: LandmarkOptions = field(default_factory=LandmarkOptions)
+    kind: str = landmark_rows.LANDMARKS
+    summary: str = "landmarks"
+
+    @property
+    def parameters(self) -> Mapping[str, Any]:
+        return {"revision": REVISION, **asdict(self.options)}
+
+    def compute(self, store: Store, map_id: int, progress: Callable[[int, int], None]) -> LandmarkSet:
+        from semdb.landmarks.build import SeenKeyframe, find_landmarks
+        from semdb.landmarks.lift import SeenObject, lift_keyframe
+        from semdb.threads import cores, each
+
+        gravity = landmark_rows.load_gravity(store.engine, map_id)
+        up = np.array(gravity.up) if gravity is not None and gravity.given else None
+        placed, names = placed_objects(store.iter_objects(map_id, None, store.left_out))
+        confusion = _confusion(placed, names)
+        total = 2 * max(store.keyframe_count(map_id), 1)
+        numbers = {name: k for k, name in enumerate(names)}
+        rows: list[KeyframeDepth] = []
+        seen: list[SeenKeyframe] = []
+
+        def lift(row: KeyframeDepth) -> SeenKeyframe | CodecError:
+            size = (row.camera.height, row.camera.width)
+            try:
+                things = [
+                    SeenObject(
+                        numbers[o.category], o.score, decode_mask(o.mask, f"objects.mask of object {o.id}", size)
+                    )
+                    for o in row.objects
+                ]
+                depth = depth_of(row)
+            except CodecError as error:
+                return error
+            lifted = lift_keyframe(
+                row.camera, row.world_from_camera, depth, things, self.options.lift, self.options.see
+            )
+            category = np.array([thing.category for thing in things], np.int64)
+            score = np.array([thing.score for thing in things], np.float64)
+            time = row.timestamp_ns if row.timestamp_ns is not None and row.timestamp_ns >= CLOCK_NS else None
+            return SeenKeyframe(lifted, category, score, recordings.setdefault(row.recording, len(recordings)), time)
+
+        recordings: dict[str, int] = {}
+        for chunk in landmark_rows.iter_keyframe_depths(store.engine, map_id, store.left_out):
+            for row in chunk:
+                recordings.setdefault(row.recording, len(recordings))
+                for thing in row.objects:  # of a keyframe whose objects have no place, perhaps
+                    if thing.category not in numbers:
+                        numbers[thing.category] = len(numbers)
+            for row, found in zip(chunk, each(lift, chunk, cores()), strict=True):
+                if isinstance(found, CodecError):
+                    store.left_out(row.id, found)
+                    continue
+                rows.append(row)
+                seen.append(found)
+            progress(min(len(rows), total // 2), total)
+
+        def show(done: int, of: int) -> None:
+            progress(total // 2 + done * total // (2 * max(of, 1)), total)
+
+        classes = sorted(numbers, key=lambda name: numbers[name])
+        wide = np.zeros((len(classes), len(classes)))
+        wide[: len(names), : len(names)] = confusion
+        found_all = find_landmarks(seen, len(classes), wide, up, self.options, show)
+        return _stored(found_all, rows, classes)
+
+    def write(self, connection: Connection, map_id: int, result: LandmarkSet) -> int:
+        from semdb.landmarks.identity import keep_ids
+
+        return landmark_rows.replace_landmarks(connection, map_id, result, keep_ids)
+
+
+def _confusion(placed: Any, names: Sequence[str]) -> FloatArray:
+    """Shares ``[classes, classes]`` of what goes by another name, as the step `classes` finds them."""
+    options = ConfusionOptions()
+    found = np.zeros((len(names), len(names)))
+    for item in confusions(co_detections(placed, len(names), options), options):
+        found[item.category, item.other] = item.weight / MILLION
+    return found
+
+
+def depth_of(row: KeyframeDepth) -> Float32Array | None:
+    """Depth ``[H, W]`` in metres, registered to colour; None without. Raises CodecError for a damaged file."""
+    from semdb.recordings.images import decode_depth
+    from semdb.recordings.registration import depth_size, register_depth
+
+    if row.depth is None or row.depth_scale is None:
+        return None
+    name = f"keyframe_images.depth of keyframe {row.id}"
+    try:
+        size = depth_size(row.camera, row.depth_registration)
+        depth = decode_depth(row.depth, name, row.depth_scale, size)
+        return register_depth(depth, row.depth_registration, row.camera)
+    except FrameError as error:
+        raise CodecError(str(error)) from None
+
+
+def _stored(found: Any, rows: Sequence[KeyframeDepth], classes: Sequence[str]) -> LandmarkSet:
+    from semdb.landmarks.boxes import upright_axes
+    from semdb.landmarks.relations import find_relations
+
+    axes = upright_axes(found.gravity.up)
+    stored = []
+    for thing in found.landmarks:
+        first = thing.box.axes[:, 0] @ axes
+        evidence = {
+            classes[k]: round(float(value), 6) for k, value in enumerate(thing.evidence) if value >= LEAST_EVIDENCE
+        }
+        times = [rows[m.keyframe].timestamp_ns for m in thing.members]
+        known = [time for time in times if time is not None]
+        x, y, z = (float(value) for value in thing.box.centre)
+        sx, sy, sz = (float(value) for value in thing.box.size)
+        stored.append(
+            LandmarkRow(
+                category=classes[thing.category],
+                probability=thing.probability,
+                evidence=evidence,
+                position=(x, y, z),
+                covariance=thing.covariance,
+                size=(sx, sy, sz),
+                yaw=float(np.arctan2(first[1], first[0])),
+                keyframes=thing.keyframes,
+                missed=thing.missed,
+                seen_through=thing.seen_through,
+                state=str(thing.state),
+                first_keyframe_id=rows[thing.first].id,
+                last_keyframe_id=rows[thing.last].id,
+                first_seen_ns=min(known, default=None),
+                last_seen_ns=max(known, default=None),
+                sightings=tuple(
+                    LandmarkSighting(rows[m.keyframe].objects[m.ordinal].id, m.coverage, m.visibility)
+                    for m in thing.members
+                ),
+                views=tuple(
+                    LandmarkView(rows[v.keyframe].objects[v.ordinal].id, v.quality, v.distance) for v in thing.views
+                ),
+            )
+        )
+    related = find_relations(found.landmarks, classes, found.gravity.up)
+    up_x, up_y, up_z = (float(value) for value in found.gravity.up)
+    gravity = GravityRow(
+        (up_x, up_y, up_z),
+        found.gravity.up_certainty,
+        found.gravity.floor,
+        found.gravity.floor_certainty,
+        found.gravity.given,
+    )
+    relations = tuple(LandmarkRelation(r.one, str(r.kind), r.other, r.score) for r in related)
+    return LandmarkSet(tuple(stored), relations, gravity)
