@@ -38,8 +38,9 @@ def keyframe_of(rows: KeyframeRows, key: int) -> StoredKeyframe:
     row, where = rows.frames[key], f"keyframe {key}"
     head = head_of(row)
     camera = head.camera
-    if key not in rows.keypoints or (rows.descriptors is not None and key not in rows.descriptors):
-        raise CodecError(f"{where} has no keypoints or no descriptors: `semdb delete keyframes {key}` removes it")
+    for table, known in (("keypoints", rows.keypoints), ("descriptors", rows.descriptors)):
+        if known is not None and key not in known:
+            raise CodecError(f"{table} has no row of {where}")
     blob = checked.blob(rows.keypoints[key].data, f"keypoints.data of {where}")
     packed = keypoint_rows(blob, f"keypoints.data of {where}")
     _check_keypoints(packed, rows.keypoints[key], camera, where)

@@ -241,7 +241,8 @@ def load_image(engine: Engine, keyframe_id: int) -> StoredImage:
     query = query.where(c.keyframe_id == int(keyframe_id))
     row = retry.read(engine, lambda connection: connection.execute(query).one_or_none())
     if row is None:
-        raise NotFoundError(f"there is no image of the keyframe {keyframe_id}")
+        check_keyframes(engine, [keyframe_id])
+        raise CodecError(f"keyframe_images has no row of keyframe {keyframe_id}")
 
     def name(column: str) -> str:
         return f"keyframe_images.{column} of keyframe {keyframe_id}"

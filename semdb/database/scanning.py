@@ -18,6 +18,7 @@ from semdb.database.codecs import decode_vectors
 from semdb.database.exact_sums import exact_sum, whole
 from semdb.database.reading import Bad, keyframe_ids
 from semdb.database.tables import categories, cnn_vectors, keyframe_categories, keyframes, maps, recordings
+from semdb.errors import CodecError
 from semdb.types import Float32Array, Int64Array
 
 IN_CHUNK = 500
@@ -48,10 +49,17 @@ def vectors_there(
     """Vectors float32 ``[n, d]`` of those of `ids` that are there, and their ids, ascending.
 
     `size` is how many numbers they have to have, by default as many as most have. A damaged one is zero and told to
-    `bad`, or raises CodecError.
+    `bad`, or raises CodecError; so is a keyframe that has none, which is left out.
     """
     wanted = np.unique(ids)
-    return _decoded(retry.read(engine, lambda connection: _rows(connection, wanted)), size, bad)
+
+    def work(connection: Connection) -> tuple[list[tuple[int, bytes]], list[int]]:
+        rows = _rows(connection, wanted)
+        return rows, _without_row(connection, wanted, rows)
+
+    rows, without = retry.read(engine, work)
+    _tell_missing(without, bad)
+    return _decoded(rows, size, bad)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +79,7 @@ def coarse_rows(
     One that was moved into another map is not there.
     """
 
-    def work(connection: Connection) -> tuple[list[tuple[int, bytes]], list[tuple[int, str, int]]]:
+    def work(connection: Connection) -> tuple[list[tuple[int, bytes]], list[int], list[tuple[int, str, int]]]:
         k = keyframes.c
         mine = select(k.id).join(recordings, recordings.c.id == k.recording_id).where(recordings.c.map_id == map_id)
         asked = np.unique(ids).tolist()
@@ -87,9 +95,11 @@ def coarse_rows(
             for part, number in zip(Part, map(_held, numbers), strict=True)
             if number
         ]
-        return _rows(connection, wanted), shown
+        rows = _rows(connection, wanted)
+        return rows, _without_row(connection, wanted, rows), shown
 
-    rows, shown = retry.read(engine, work)
+    rows, without, shown = retry.read(engine, work)
+    _tell_missing(without, bad)
     found, vectors = _decoded(rows, size, bad)
     there = set(found.tolist())
     return CoarseRows(found, vectors, tuple(item for item in shown if item[0] in there))
@@ -227,6 +237,27 @@ def _rows(connection: Connection, ids: Int64Array) -> list[tuple[int, bytes]]:
         for keys in _in_chunks(ids.tolist())
         for row in connection.execute(query.where(c.keyframe_id.in_(keys)))
     ]
+
+
+def _without_row(connection: Connection, ids: Int64Array, rows: Sequence[tuple[int, bytes]]) -> list[int]:
+    """Those of `ids` that are there, but not in `rows`: others were deleted a moment ago."""
+    if len(rows) == len(ids):
+        return []
+    lacking = sorted(set(ids.tolist()) - {row[0] for row in rows})
+    query = select(keyframes.c.id)
+    return [
+        key
+        for keys in _in_chunks(lacking)
+        for key in connection.execute(query.where(keyframes.c.id.in_(keys))).scalars()
+    ]
+
+
+def _tell_missing(keys: Sequence[int], bad: Bad | None) -> None:
+    for key in keys:
+        error = CodecError(f"cnn_vectors has no row of keyframe {key}")
+        if bad is None:
+            raise error
+        bad(key, error)
 
 
 def _in_chunks(keys: Sequence[int]) -> Iterator[Sequence[int]]:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from semdb.errors import CodecError
 from semdb.exchange.source import ExportOptions, MapSource, decoded, new_folder, suffix_of
 from semdb.exchange.tracks import Tracks, View, find_tracks
 from semdb.geometry import invert_pose, quat_wxyz_from_rotation, transform_points
@@ -68,9 +69,17 @@ def _tracks(source: MapSource) -> tuple[Tracks, list[int]]:
     """Tracks over all keyframes, and how many keypoints each keyframe has."""
     counts = [len(keyframe.keypoints) for keyframe in source.keyframes(descriptors=False)]
 
+    widths: dict[int, int] = {}  # of descriptors, and a keyframe that has them
+
     @lru_cache(maxsize=VIEWS_KEPT)
     def view_of(index: int) -> View:
-        return load_view(source, index)
+        view, key = load_view(source, index), source.heads[index].id
+        if len(view.xy):
+            widths.setdefault(view.descriptors.shape[1], key)
+        if len(widths) > 1:
+            each = ", ".join(f"{width} numbers in keyframe {of}" for width, of in widths.items())
+            raise CodecError(f"descriptors.data of one map differ: {each}; delete what is damaged")
+        return view
 
     poses = np.stack([head.world_from_camera for head in source.heads])
     return find_tracks(poses, counts, view_of, lambda done: source.tell("joining points of", done)), counts

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -42,10 +44,26 @@ def export_map(
 ) -> str:
     """Writes a map in a format; returns a line about what was written.
 
-    Raises UsageError for a format that is none, or where something is at `out` already; NotFoundError for the map.
+    One that fails leaves nothing at `out`. Raises UsageError for a format that is none, or where something is at `out`
+    already; NotFoundError for the map; DatabaseError; CodecError for damaged rows.
     """
     if name not in FORMATS:
         raise UsageError(f"there is no format {name!r}; there are {', '.join(FORMATS)}")
     module, function = FORMATS[name].where.split(":")
     write = cast(Exporter, getattr(import_module(module), function))
-    return write(MapSource.of(store, map_name, progress), out, options or ExportOptions())
+    source = MapSource.of(store, map_name, progress)
+    there = os.path.lexists(out)
+    try:
+        return write(source, out, options or ExportOptions())
+    except BaseException:
+        if not there:
+            _remove(out)
+        raise
+
+
+def _remove(made: Path) -> None:
+    """A part of a map looks like one."""
+    if made.is_dir():
+        shutil.rmtree(made, ignore_errors=True)
+    else:
+        made.unlink(missing_ok=True)
