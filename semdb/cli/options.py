@@ -85,6 +85,9 @@ _READING = {
     "times": _reading("--times", "HOW", "reversed: the poses run backwards through the times of colour."),
     "scale": _reading("--scale", "N", "Metres per unit of poses."),
     "up": _reading("--up", "X,Y,Z", "Up in the world of the poses, which becomes z; or 'cameras': where theirs is."),
+    "depth_camera": _reading(
+        "--depth-camera", "fx,fy,cx,cy[,x,y,z]", "Where depth is from, if not from the colour camera (place in metres)."
+    ),
     "color_topic": _reading("--color-topic", "TOPIC", "Colour images of a ROS bag."),
     "depth_topic": _reading("--depth-topic", "TOPIC", "Depth images of a ROS bag."),
     "info_topic": _reading("--info-topic", "TOPIC", "camera_info of the colour camera of a ROS bag."),

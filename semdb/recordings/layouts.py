@@ -23,6 +23,7 @@ from semdb.recordings import (
     tum,
 )
 from semdb.recordings.base import Layout, Recording
+from semdb.recordings.depth_camera import take_depth_camera
 from semdb.recordings.intrinsics import depth_scale_problem
 from semdb.recordings.options import ReadOptions, option_of
 from semdb.types import Camera
@@ -66,6 +67,8 @@ def open_with(layout: Layout, path: Path, camera: Camera | None, options: ReadOp
     for recording in found:
         recording.reading, recording.takes = options, layout.takes
         set_upright(recording)
+        if options.depth_camera is not None:
+            take_depth_camera(recording, options.depth_camera)
     return found
 
 

@@ -21,6 +21,7 @@ BODY = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0
 AXES: Mapping[str, FloatArray] = {"opencv": np.eye(4), "opengl": BACK, "arkit": BACK, "ros": BODY}
 QUATERNIONS = ("xyzw", "wxyz")
 REVERSED = "reversed"
+DEPTH_CAMERA_USAGE = "--depth-camera takes fx,fy,cx,cy or fx,fy,cx,cy,x,y,z"
 BY_CAMERAS = "cameras"  # up is where the cameras' is
 
 
@@ -32,7 +33,7 @@ class ReadOptions:
     `quaternion` in which order they have their numbers. `time_offset_ms` is added to the times of poses,
     `depth_offset_ms` to those of depth, to get those of colour; `times` "reversed" says that poses run backwards
     through them. `scale` is metres per unit of poses, `up` "x,y,z" (or "cameras") the direction in their world that
-    becomes z. Topics and frames are of ROS bags.
+    becomes z. `depth_camera` "fx,fy,cx,cy[,x,y,z]" is where depth files are from. Topics and frames are of ROS bags.
     """
 
     depth_scale: float | None = None
@@ -44,6 +45,7 @@ class ReadOptions:
     times: str | None = None
     scale: float | None = None
     up: str | None = None
+    depth_camera: str | None = None
     color_topic: str | None = None
     depth_topic: str | None = None
     info_topic: str | None = None
@@ -56,6 +58,8 @@ class ReadOptions:
         _check_choice("--times", self.times, (REVERSED,))
         if self.up is not None:
             self.turn([])
+        if self.depth_camera is not None:
+            numbers_in(self.depth_camera, (4, 7), DEPTH_CAMERA_USAGE)
         for name in ("depth_scale", "scale"):
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0):
@@ -91,18 +95,23 @@ class ReadOptions:
             return None
         if self.up == BY_CAMERAS:
             return upright(-np.mean([pose[:3, 1] for pose in poses], axis=0)) if len(poses) else np.eye(4)
-        try:
-            up = np.array([float(part) for part in self.up.split(",")])
-        except ValueError:
-            up = np.empty(0)
-        if up.shape != (3,) or not np.isfinite(up).all():
-            raise UsageError(f"--up takes x,y,z or {BY_CAMERAS}, but is {self.up!r}")
-        return upright(up)
+        return upright(numbers_in(self.up, (3,), f"--up takes x,y,z or {BY_CAMERAS}"))
 
     @property
     def changes_poses(self) -> bool:
         """Whether `pose` does anything."""
         return self.poses_are != WORLD_FROM_CAMERA or self.axes not in (None, "opencv") or self.scale is not None
+
+
+def numbers_in(text: str, counts: tuple[int, ...], usage: str) -> FloatArray:
+    """Finite numbers between commas, as many as one of `counts`. Raises UsageError that begins with `usage`."""
+    try:
+        found = np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        found = np.empty(0)
+    if len(found) not in counts or not np.isfinite(found).all():
+        raise UsageError(f"{usage}, but is {text!r}")
+    return found
 
 
 def upright(up: FloatArray) -> FloatArray:

@@ -217,6 +217,16 @@ LAYOUT = Layout(
     is_tum,
     lambda path, camera, options: [open_tum(path, camera, options)],
     frozenset(
-        {"depth_scale", "poses_are", "axes", "scale", "quaternion", "time_offset_ms", "depth_offset_ms", "times"}
+        {
+            "depth_scale",
+            "poses_are",
+            "axes",
+            "scale",
+            "quaternion",
+            "time_offset_ms",
+            "depth_offset_ms",
+            "times",
+            "depth_camera",
+        }
     ),
 )

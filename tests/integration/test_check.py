@@ -191,17 +191,25 @@ def test_a_wrong_focal_length(room: Path, tmp_path: Path, factor: float) -> None
     assert_mended(folder, finding)
 
 
-def test_depth_of_another_place(room: Path, tmp_path: Path) -> None:
-    def farther_in(depth: np.ndarray) -> np.ndarray:
-        """As a depth camera of a longer focal length sees it."""
-        matrix = np.array([[1.15, 0, -0.15 * 159.5], [0, 1.15, -0.15 * 119.5]])
-        return cv2.warpAffine(depth, matrix, (320, 240), flags=cv2.INTER_NEAREST)
+@pytest.mark.parametrize(("zoom", "shift"), [(1.15, (0, 0)), (0.9, (9, 0)), (1.0, (10, -8))])
+def test_depth_of_another_camera(room: Path, tmp_path: Path, zoom: float, shift: tuple[int, int]) -> None:
+    """As a camera beside it with another focal length sees it: pixels of an image of 320."""
 
-    report = check_recording(open_recording(with_depth(room, tmp_path / "room", farther_in)))
-    kinds = {finding.kind for finding in report.findings}
-    assert kinds == {"depth_registration"}, report
-    [finding] = report.findings
-    assert float(finding.value) == pytest.approx(1 / 1.15, abs=0.06)
+    def seen(depth: np.ndarray) -> np.ndarray:
+        x, y = (1 - zoom) * 159.5 + shift[0], (1 - zoom) * 119.5 + shift[1]
+        return cv2.warpAffine(depth, np.array([[zoom, 0, x], [0, zoom, y]]), (320, 240), flags=cv2.INTER_NEAREST)
+
+    folder = with_depth(room, tmp_path / "room", seen)
+    recording = open_recording(folder)
+    finding = the_finding(recording, "depth_registration")
+    assert not finding.certain
+    assert float(finding.value) == pytest.approx(1 / zoom, abs=0.06)
+    fx, _, cx, cy = (float(v) for v in finding.option.removeprefix("--depth-camera ").split(","))
+    camera = recording.camera
+    assert fx == pytest.approx(zoom * camera.fx, rel=0.04)
+    assert cx == pytest.approx(zoom * (camera.cx - 159.5) + 159.5 + shift[0], abs=4)
+    assert cy == pytest.approx(zoom * (camera.cy - 119.5) + 119.5 + shift[1], abs=4)
+    assert_mended(folder, finding)
 
 
 def test_ingest_stops_for_what_is_certain_and_goes_on_when_mended(room: Path, tmp_path: Path) -> None:

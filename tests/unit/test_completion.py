@@ -69,7 +69,7 @@ def test_lines_are_split_as_a_shell_does(line: str, expected: Line) -> None:
         ("semdb localize --map room --m", []),  # given once is enough
         (
             "semdb localize --depth a.png --dept",
-            ["--depth", "--depth-scale", "--depth-offset-ms", "--depth-topic"],
+            ["--depth", "--depth-scale", "--depth-offset-ms", "--depth-camera", "--depth-topic"],
         ),  # may be repeated
         ("semdb localize --like ", ["corridor", "first visit", "FILES"]),
         ("semdb localize --coarse ", ["sql", "index"]),

@@ -12,9 +12,20 @@ from hypothesis import strategies as st
 
 from semdb.errors import RecordingError, UsageError
 from semdb.geometry import invert_pose, pose_error, pose_from, rotation_from_quat_wxyz, so3_exp
-from semdb.recordings import ReadOptions, open_recording
+from semdb.recordings import ReadOptions, decode_depth, open_recording
 from semdb.recordings.options import AXES, read_options, write_options
-from tests.unit.recording_miniatures import SMALL, pose, pose_text, write_icl, write_seven_scenes, write_tum
+from semdb.types import Camera
+from tests.unit.recording_miniatures import (
+    SMALL,
+    depth_units,
+    pose,
+    pose_text,
+    render,
+    write_icl,
+    write_image,
+    write_seven_scenes,
+    write_tum,
+)
 
 TIMES = [f"{100 + i * 0.1:.6f}" for i in range(6)]
 
@@ -134,6 +145,32 @@ def test_options_reach_the_poses_before_the_format_turns_them(tmp_path: Path) ->
             assert max(pose_error(one, other)) < 1e-6
 
 
+def test_depth_of_a_camera_beside_colour(tmp_path: Path) -> None:
+    """Another focal length, 3 cm to the right: registered, colour's pixels have colour's depth."""
+    folder = write_tum(tmp_path / "walk")
+    own, place = Camera(64, 48, 55.0, 56.0, 30.0, 24.0), pose_from(np.eye(3), [0.03, -0.01, 0.005])
+    for i in range(6):
+        _, z = render(own, pose(i) @ place)
+        write_image(folder / "depth" / f"{100 + i * 0.1 + 0.004:.6f}.png", depth_units(z, 5000))
+    said = "55,56,30,24,0.03,-0.01,0.005"
+    recording = open_recording(folder, options=ReadOptions(depth_camera=said))
+    assert f"depth is of the camera {said} and registered to colour" in recording.notes
+    for number, frame in enumerate(recording.frames()):
+        image, z = render(SMALL, pose(number))
+        np.testing.assert_array_equal(frame.image, image)
+        assert frame.depth is not None
+        assert frame.depth_bytes is not None
+        assert np.isfinite(frame.depth).mean() > 0.7
+        assert np.nanpercentile(np.abs(frame.depth - z), 95) < 0.01
+        stored = decode_depth(frame.depth_bytes, "d", frame.depth_scale or 0, (64, 48))
+        np.testing.assert_array_equal(stored, frame.depth)
+        assert frame.depth_registration == ""
+    with pytest.raises(UsageError, match="--depth-camera: fx and fy must be positive"):
+        open_recording(folder, options=ReadOptions(depth_camera="0,56,30,24"))
+    with pytest.raises(UsageError, match="--depth-camera: "):
+        open_recording(folder, options=ReadOptions(depth_camera="5,56,30,24"))
+
+
 def test_an_option_that_means_nothing_to_the_format_is_refused(tmp_path: Path) -> None:
     folder = write_tum(tmp_path / "walk")
     with pytest.raises(UsageError, match=r"walk: --color-topic means nothing to a recording of format tum; it takes"):
@@ -153,6 +190,7 @@ def test_an_option_that_means_nothing_to_the_format_is_refused(tmp_path: Path) -
         ({"times": "sideways"}, "--times sideways: known are reversed"),
         ({"up": "down"}, "--up takes x,y,z or cameras, but is 'down'"),
         ({"up": "0,0,0"}, "--up 0,0,0: no direction is up in it"),
+        ({"depth_camera": "50,50,31.5"}, "--depth-camera takes fx,fy,cx,cy or fx,fy,cx,cy,x,y,z, but is '50,50,31.5'"),
         ({"time_offset_ms": float("inf")}, "--time-offset-ms must be a number of milliseconds"),
     ],
 )

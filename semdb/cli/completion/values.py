@@ -15,7 +15,7 @@ Environment = Mapping[str, str]
 
 MOST_NAMES = 200
 _PATHS = re.compile(r"\b(PATH|FILE|FOLDER|DIR|IMAGE)\b")  # words of metavars
-EXPORTS = ("tum", "colmap", "kapture", "ply", "mcap", "g2o", "semdb")
+EXPORTS = ("tum", "colmap", "kapture", "ply", "mcap", "rrd", "g2o", "semdb")
 METHODS = ("semdb", "cnn", "paper", "chen", "sift-reference", "oracle", "colmap")
 FIXED: Mapping[str, Entries] = {
     "--features": (("surf", "SURF, 64 dimensions"), ("sift", "SIFT"), ("orb", "ORB, binary")),
@@ -30,6 +30,7 @@ FIXED: Mapping[str, Entries] = {
     "--poses-are": (("world_from_camera", "usual"), ("camera_from_world", "inverted")),
     "--axes": (("opencv", "z forward"), ("opengl", "z back"), ("arkit", "z back"), ("ros", "x forward")),
     "--quaternion": (("xyzw", "as TUM"), ("wxyz", "")),
+    "--times": (("reversed", "poses run backwards"),),
     "--optimizer": (("sgd", ""), ("adamw", "")),
     "--database-url": (("sqlite:///", "a file"), ("mysql+pymysql://", "a server")),
 }

@@ -36,6 +36,7 @@ USUAL_SCALES = (1.0, 100.0, 256.0, 500.0, 1000.0, 2000.0, 4000.0, 5000.0, 6553.5
 LEAST_FACTOR = 1.12  # of depth or focal length; a smaller one is calibration, no convention
 ROOM_M = (0.15, 15.0)  # within which the median depth of a room lies
 LEAST_OFFSET_S = 0.02
+FULL = (640, 480)  # of the image whose pixels a displacement of depth is given in
 LEAST_RATIO, CERTAIN_RATIO = 1.6, 2.0  # of translations by images and by poses
 SPREADS, WIDEST_SPREAD = 3.0, 0.45  # of their logarithms
 
@@ -294,12 +295,25 @@ def _depth_findings(observed: Observed) -> Iterator[Finding]:
         option = f"--depth-offset-ms {offset}" if "depth_offset_ms" in observed.takes else ""
         yield Finding("depth_time_offset", False, offset, option, f"{text}: its edges lie behind those of what moves")
         return
-    text = f"depth is not registered to colour: its edges fit when {place.zoom:.2f} times as large"
     x, y = place.shift
-    yield Finding(
-        "depth_registration",
-        False,
-        place.zoom,
-        "",
-        f"{text} and moved by {x:.0f}, {y:.0f} px of 640: register it first",
+    option = ""
+    if "depth_camera" in observed.takes and observed.camera is not None:
+        option = f"--depth-camera {_depth_camera(observed.camera, place)}"
+    text = (
+        f"depth is not registered to colour: its edges fit when {place.zoom:.2f} times as large and moved by {x:.0f}, "
+        f"{y:.0f} px of 640: register it first, or say where it is from"
     )
+    yield Finding("depth_registration", False, place.zoom, option, text)
+
+
+def _depth_camera(camera: Camera, place: Misplaced) -> str:
+    """Intrinsics of the camera that sees depth where it is: its image, stretched and moved, is colour's."""
+    numbers = []
+    for size, full, focal, middle, shift in (
+        (camera.width, FULL[0], camera.fx, camera.cx, place.shift[0]),
+        (camera.height, FULL[1], camera.fy, camera.cy, place.shift[1]),
+    ):
+        own = (middle - (1 - place.zoom) * (size - 1) / 2 - shift * size / full) / place.zoom
+        numbers.append((focal / place.zoom, own))
+    (fx, cx), (fy, cy) = numbers
+    return f"{fx:.5g},{fy:.5g},{cx:.5g},{cy:.5g}"
