@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import replace
@@ -120,7 +121,7 @@ def _read_depth_list(
     path: Path, pairs: list[TimedFile] | None, notes: list[str], options: ReadOptions
 ) -> list[TimedFile] | None:
     """Depth images in order of time, of `pairs` where the list of colour images names them too."""
-    if pairs is None and not (path / "depth.txt").exists():
+    if pairs is None and not os.path.lexists(path / "depth.txt"):  # a link to nothing is named when it is read
         notes.append("no depth.txt: the frames have no depth")
         return None
     listed = "depth.txt" if pairs is None else ASSOCIATIONS
@@ -138,7 +139,7 @@ def _read_depth_list(
 
 
 def _read_poses(path: Path, notes: list[str], options: ReadOptions, times_ns: Sequence[int]) -> Trajectory | None:
-    if not (path / "groundtruth.txt").exists():
+    if not os.path.lexists(path / "groundtruth.txt"):
         notes.append("no groundtruth.txt: the frames have no pose and cannot become keyframes")
         return None
     trajectory, pose_notes = read_trajectory(path / "groundtruth.txt", options, times_ns)

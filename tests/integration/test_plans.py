@@ -17,10 +17,12 @@ from semdb.cli.main import app
 from semdb.database.store import Store, open_store
 from semdb.errors import UsageError
 from semdb.ingestion.keyframes import select_keyframes
+from semdb.ingestion.queue import Workplace, queue_recordings
 from semdb.ingestion.run import IngestOptions, IngestSummary, ingest_recordings
 from semdb.recordings import open_recording
 from semdb.settings import Settings
 from tests.integration.comparison import content
+from tests.integration.test_queue import Outbox
 
 FEW, MORE = 4, 7
 
@@ -189,3 +191,18 @@ def test_an_ingest_that_stores_nothing_says_nothing_of_objects(room: Path, tmp_p
     assert again["keyframes"] == "keyframes  2 planned, 0 stored now, 2 stored before, 0 failed"
     assert re.fullmatch(r"objects    \d+, and \d+ keypoints, in the keyframe stored now", more["objects"])
     assert more["keyframes"] == "keyframes  3 planned, 1 stored now, 2 stored before, 0 failed"
+
+
+def test_workers_get_what_was_added(room: Path, tmp_path: Path) -> None:
+    url, outbox = f"sqlite:///{tmp_path / 'a.sqlite3'}", Outbox()
+    place = Workplace(settings(url))
+    for count, sent in ((3, 3), (5, 2), (5, 0)):
+        before = len(outbox)
+        queue_recordings([str(room)], settings(url), IngestOptions(map_name="m", keyframes=count), outbox.send)
+        frames = [frame for _, _, chunk in outbox[before:] for frame in chunk]
+        assert len(frames) == sent
+        for recording_id, source, chunk in outbox[before:]:
+            outcome = place.do(recording_id, source, chunk)
+            assert (outcome.stored, outcome.failed, outcome.complete) == (sent, {}, True)
+    with open_store(url) as store:
+        assert frames_of(store) == densified(room, [0], 5)

@@ -54,6 +54,15 @@ def test_tum_without_the_colour_list(walk: Path) -> None:
         open_recording(walk)
 
 
+@pytest.mark.parametrize("name", ["rgb.txt", "depth.txt", "groundtruth.txt", "camera.json"])
+def test_a_link_to_nothing_is_not_taken_for_a_file_that_nobody_has(walk: Path, name: str) -> None:
+    """As when the folder with the trajectories was moved."""
+    (walk / name).unlink()
+    (walk / name).symlink_to("/nowhere/at/all")
+    with pytest.raises(RecordingError, match=f"{name}: the file is missing"):
+        open_recording(walk)
+
+
 def test_missing_truncated_and_text_images_are_dropped(walk: Path) -> None:
     (walk / "rgb/100.000000.png").unlink()
     data = (walk / "rgb/100.100000.png").read_bytes()
