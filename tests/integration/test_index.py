@@ -137,9 +137,9 @@ def test_only_what_changed_is_read(store: Store, options: IndexOptions, monkeypa
     read: list[list[int]] = []
     rows = store.coarse_rows
 
-    def counted(keys: Int64Array, **how: Any) -> CoarseRows:
+    def counted(key: int, keys: Int64Array, *given: Any, **how: Any) -> CoarseRows:
         read.append(keys.tolist())
-        return rows(keys, **how)
+        return rows(key, keys, *given, **how)
 
     monkeypatch.setattr(store, "coarse_rows", counted)
     monkeypatch.setattr(store, "iter_vectors", lambda *_: pytest.fail("the whole map was read"))
