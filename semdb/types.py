@@ -171,6 +171,7 @@ class Description:
     models: tuple[ModelInfo, ...]  # detector, encoder, features
     timing_ms: Mapping[str, float] = field(default_factory=dict)  # detect, encode, features
     grey: ImageArray | None = None  # [H, W] the image in grey, to look at its pixels again; not stored
+    depth: Float32Array | None = None  # [H, W] metres, NaN where there is none; not stored
     sightings: tuple[Sighting, ...] | None = None  # all that the detector saw; None: the detections
     dynamic: frozenset[str] = frozenset()  # categories of objects that move: they say nothing about a place
 

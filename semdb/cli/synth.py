@@ -38,6 +38,9 @@ def command(
         float, typer.Option(metavar="0..1", help="Share of them that go by the name of a class like theirs.")
     ] = 0.0,
     person: Annotated[bool, typer.Option("--person", help="Somebody walks to and fro before the camera.")] = False,
+    plain: Annotated[
+        bool, typer.Option("--plain", help="Everything in one colour each, but for one picture: hardly any texture.")
+    ] = False,
 ) -> None:
     """Render a furnished room as a recording.
 
@@ -61,6 +64,7 @@ def command(
         second_visit=second_visit,
         lap_frames=lap_frames,
         person=person,
+        plain=plain,
         missed=missed,
         confused=confused,
     )

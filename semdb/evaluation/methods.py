@@ -78,6 +78,7 @@ METHODS = {
                 neighbours=0,
                 twins=0,
                 refined_points=False,
+                surfaces=None,
             ),
         ),
         Method(
@@ -90,6 +91,7 @@ METHODS = {
                 neighbours=0,
                 twins=0,
                 refined_points=False,
+                surfaces=None,
             ),
             features="orb",
         ),
@@ -110,6 +112,11 @@ METHODS = {
             "semdb-own-points",
             "as semdb with the 3D points that each keyframe measured, without those of semdb refine",
             LocalizerOptions(refined_points=False),
+        ),
+        Method(
+            "semdb-no-surfaces",
+            "as semdb without laying the depth of queries on the map's surfaces",
+            LocalizerOptions(surfaces=None),
         ),
         Method("hard", "as semdb with the hard class filter alone", LocalizerOptions(coarse=_HARD)),
         Method(

@@ -18,10 +18,13 @@ from semdb.errors import CodecError, FrameError, NotFoundError
 from semdb.geometry import POSE_UNIT_M, pose_distances
 from semdb.geometry.sensor import depth_noise
 from semdb.localization.coarse import MapChange
+from semdb.localization.surface_alignment import PlacedSurfaces, place
+from semdb.localization.surface_cache import SurfaceCache
 from semdb.localization.views import ClassNumbers, KeyframeView, make_keyframe_view
 from semdb.recordings.images import decode_color_grey, has_size
 from semdb.types import Float32Array, FloatArray, ImageArray, Keypoints
 
+FAR_SURFACES = 12.0  # of `pose_distances`: keyframes further off show nothing that a query could lie on
 USED, STALE, NONE, OFF = "used", "stale", "none", "off"  # what becomes of its points
 
 
@@ -42,6 +45,7 @@ class KeyframeCache:
         self._names: dict[int, tuple[str, int]] = {}
         self._poses: tuple[list[int], FloatArray] | None = None
         self._stale: set[int] = set()  # keyframes whose poses are to be read again
+        self._surfaces = SurfaceCache(store)
         self._refined = refined
         self._points: str | None = None if refined else OFF
         self.left_out: dict[int, CodecError] = {}  # keyframes that cannot be used
@@ -65,6 +69,7 @@ class KeyframeCache:
             if self._points == USED:
                 self._views.clear()  # their points belong to the map as it was
             self._points = None
+        self._surfaces.forget(None if change.everything else change.added | change.gone)
         if change.everything:
             self._views.clear()
             self._names.clear()
@@ -173,6 +178,19 @@ class KeyframeCache:
         order = [int(n) for n in np.argsort(distance, kind="stable") if distance[n] < limit]
         rows = [close[n] for n in order if ids[close[n]] not in without][:count]
         return [ids[n] for n in rows], poses[rows]
+
+    def surfaces_near(self, pose: FloatArray, count: int) -> list[PlacedSurfaces]:
+        """Surfaces of the `count` keyframes nearest to `pose` that have depth, or fewer, in the world."""
+        with self._turn:
+            ids, poses = self.near(pose, FAR_SURFACES, (), 2 * count)
+            placed: list[PlacedSurfaces] = []
+            for keyframe_id, world_from_camera in zip(ids, poses, strict=True):
+                surfaces = self._surfaces.of(keyframe_id)
+                if surfaces is not None:
+                    placed.append(place(keyframe_id, surfaces, world_from_camera))
+                if len(placed) == count:
+                    break
+            return placed
 
     def distances(self, pose: FloatArray, keyframe_ids: Sequence[int]) -> FloatArray:
         """How far keyframes are from `pose` (`pose_distances`); zero for one that is not there any more."""

@@ -36,9 +36,20 @@ from semdb.localization.pose import (
     rival_pose,
 )
 from semdb.localization.pose_options import PoseOptions
+from semdb.localization.surface_alignment import SurfaceOptions
+from semdb.localization.surface_search import search_surfaces
+from semdb.localization.surface_step import (
+    LaidPose,
+    SurfaceVerdictOptions,
+    estimate_with_surfaces,
+    judge_with_surfaces,
+    may_overrule,
+    weigh,
+)
+from semdb.localization.surfaces import Surfaces, surfaces_of
 from semdb.localization.verdict import Judgement, VerdictOptions, convinces, judge
 from semdb.localization.views import KeyframeView, View, make_view
-from semdb.types import Candidate, Description, Float32Array, Localization, ModelInfo, Verdict
+from semdb.types import Candidate, Description, Float32Array, FloatArray, Localization, ModelInfo, Verdict
 
 FAR = 4.0  # of `pose_distances`: keyframes nearer than this may see the same things
 ASKED_BY_SIDE = 6  # so many of the nearest are candidates for each neighbour
@@ -54,6 +65,7 @@ class LocalizerOptions:
     neighbours: int = 2  # keyframes near the first pose that join once it convinces
     twins: int = 1  # keyframes far from the pose that are asked when they look as much like the query
     refined_points: bool = True  # those of `semdb refine`, where the map has not changed since
+    surfaces: SurfaceVerdictOptions | None = field(default_factory=SurfaceVerdictOptions)  # of a query with depth
     twin_cosine: float = 0.05  # how much less than the best keyframe's cosine is "as much"
 
     def with_threads(self, threads: int) -> LocalizerOptions:
@@ -67,6 +79,7 @@ class _Search:
 
     query: View
     keyframes_in_map: int
+    laid: LaidPose | None = None
     keyframes: list[KeyframeView] = field(default_factory=list)
     matches: list[Matches] = field(default_factory=list)
     proposals: list[Proposal] = field(default_factory=list)
@@ -118,7 +131,7 @@ class Localizer:
             started = time.perf_counter()
         search.timing_ms["filter"] = source.filter_ms
         search.timing_ms["rank"] -= source.filter_ms
-        return self._conclude(search)
+        return self._conclude(search, description)
 
     def retrieve(self, description: Description, count: int) -> list[Proposal]:
         """The first `count` keyframes of the coarse step alone, in the order in which it would have them matched.
@@ -137,7 +150,7 @@ class Localizer:
         search = _Search(self._view_of(description), self._check(description))
         proposals = tuple(Proposal(i, float("nan"), float("nan")) for i in keyframe_ids)
         self._try(search, Batch(Stage.GIVEN, proposals, 0))
-        return self._conclude(search)
+        return self._conclude(search, description)
 
     def _check(self, description: Description) -> int:
         """How many keyframes the map holds, once it is known that they can be compared with `description`."""
@@ -172,7 +185,7 @@ class Localizer:
         search.matches += match_views(search.query, keyframes, self.options.pose)
         search.timing_ms["match"] += _ms_since(started)
 
-    def _conclude(self, search: _Search) -> Localization:
+    def _conclude(self, search: _Search, description: Description) -> Localization:
         damaged = [p.keyframe_id for p in search.proposals if p.keyframe_id in self.cache.left_out]
         if damaged and not search.keyframes:
             raise self.cache.left_out[damaged[0]]
@@ -188,8 +201,56 @@ class Localizer:
             rival = rival_pose(search.query, search.keyframes, search.matches, search.estimate, self.options.pose)
         evidence = None if search.estimate is None else _evidence(search, search.estimate, rival)
         judgement = judge(evidence, self.options.verdict)
+        if not convinced or judgement.verdict is not Verdict.LOCALIZED:
+            judgement, evidence = self._with_surfaces(search, description, convinced, judgement, evidence)
         search.timing_ms["pose"] += _ms_since(started)
         return self._result(search, judgement, evidence)
+
+    def _with_surfaces(
+        self,
+        search: _Search,
+        description: Description,
+        convinced: bool,
+        judgement: Judgement,
+        evidence: Evidence | None,
+    ) -> tuple[Judgement, Evidence | None]:
+        """Verdict and evidence after a query's depth was laid on the map, where it has depth; the pose with them."""
+        options = self.options.surfaces
+        surfaces = self._surfaces_of(description) if options is not None and search.keyframes else None
+        if options is None or surfaces is None:
+            return judgement, evidence
+        starts, fit = self._starts(search, options.fit), options.fit
+        fits = search_surfaces(surfaces, starts, lambda pose: self.cache.surfaces_near(pose, fit.keyframes), fit)
+        bounds = self.options.verdict
+        limits = (bounds.maximum_translation_sigma_m, bounds.maximum_rotation_sigma_deg)
+        laid = weigh(fits, search.query, search.keyframes, search.matches, options, limits)
+        if laid is None:
+            return judgement, evidence
+        search.laid, before, overrule = laid, search.estimate, False
+        if laid.is_sure:
+            pose = self.options.pose
+            found = estimate_with_surfaces(laid, search.query, search.keyframes, search.matches, options, pose)
+            anew = _evidence(search, found, 0)
+            overrule = may_overrule(convinced, anew, options)
+            if overrule:
+                search.estimate, evidence = found, anew
+        return judge_with_surfaces(judgement, before, laid, options, overrule), evidence
+
+    def _surfaces_of(self, description: Description) -> Surfaces | None:
+        """Those of a query, where it has depth that may be used."""
+        if description.depth is None or description.grey is None or not self.options.pose.use_query_depth:
+            return None
+        return surfaces_of(description.camera, description.depth, description.grey)
+
+    def _starts(self, search: _Search, options: SurfaceOptions) -> list[FloatArray]:
+        """Poses from which surfaces are laid: that of the keypoints, and those of the likeliest keyframes."""
+        estimate = search.estimate
+        order = list(range(len(search.keyframes)))
+        if estimate is not None:
+            counts = [*estimate.per_keyframe, *[0] * (len(order) - len(estimate.per_keyframe))]
+            order.sort(key=lambda slot: -counts[slot])
+        starts = [] if estimate is None else [estimate.world_from_camera]
+        return starts + [search.keyframes[slot].world_from_camera for slot in order[: options.starts]]
 
     def _ask_neighbours(self, search: _Search) -> None:
         """Keyframes near the first pose see the same things from elsewhere: their pairs steady the pose."""
@@ -259,7 +320,7 @@ class Localizer:
             keyframes_matched=len(search.keyframes),
             reason=judgement.reason,
             timing_ms=search.timing_ms,
-            evidence={} if evidence is None else evidence.as_mapping(),
+            evidence=(evidence.as_mapping() if evidence else {}) | (search.laid.as_mapping() if search.laid else {}),
             refinements={"points": self.cache.points},
             best_keyframe_id=best,
             query_xy=query_xy,

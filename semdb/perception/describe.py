@@ -143,6 +143,7 @@ class Describer:
                 "features": extract_ms + lift_ms,
             },
             grey=grey,
+            depth=view.depth,
         )
 
     def _judge(self, found: tuple[Detection, ...], height: int) -> tuple[tuple[Region, ...], tuple[Sighting, ...]]:

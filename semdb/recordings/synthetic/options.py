@@ -24,6 +24,7 @@ class SyntheticOptions:
     With `person` somebody walks to and fro before the camera.
     Rooms to be confused with others: `furniture_seed` puts the furniture of another seed into the room, `alike` mirrors
     every texture (same shapes, same colours, another room), `desks` furnishes it with so many equal workplaces.
+    `plain` paints everything in one colour each but for one picture on a wall: hardly any texture.
     `place` numbers the rooms of a building: each next one lies 20 m further along x in the world of the poses.
     Masks as a real detector's: of the instances of every frame a share `missed` is not there, and a share `confused`
     goes by the name of a class that detectors take it for.
@@ -41,6 +42,7 @@ class SyntheticOptions:
     lap_frames: int = 120
     furniture_seed: int | None = None
     alike: bool = False
+    plain: bool = False
     desks: int = 0
     person: bool = False
     place: int = 0

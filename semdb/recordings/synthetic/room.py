@@ -264,9 +264,8 @@ def _on_walls(room: Room, p: Palette, rng: Rng) -> None:
                 continue
             room.wall_use.append(use)
             pose = room.along_wall(wall, s, 0.0, z)
-            room.add(
-                "clock" if is_clock else None, furniture.clock(p) if is_clock else furniture.picture(p, w, h), pose
-            )
+            made = furniture.clock(p) if is_clock else furniture.picture(p, w, h)
+            room.add("clock" if is_clock else None, made, pose).is_picture = not is_clock
             break
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -67,6 +67,7 @@ class Item:
     label: int = 0
     spot: Spot | None = None
     at: tuple[float, float] = (0.0, 0.0)
+    is_picture: bool = False  # on a wall
 
 
 def mirrored(items: Sequence[Item]) -> list[Item]:
@@ -78,9 +79,30 @@ def mirrored(items: Sequence[Item]) -> list[Item]:
             known[id(texture)] = replace(texture, image=np.ascontiguousarray(texture.image[:, ::-1]))
         return known[id(texture)]
 
+    return _with_textures(items, turn)
+
+
+def plain(items: Sequence[Item]) -> list[Item]:
+    """`items` with every texture painted in its mean colour, but for those of the first picture on a wall."""
+    pictures = [item for item in items if item.is_picture]
+    kept = {id(face.texture) for item in pictures[:1] for prim in item.prims for face in prim.faces}
+    known: dict[int, Texture] = {}
+
+    def paint(texture: Texture) -> Texture:
+        if id(texture) in kept:
+            return texture
+        if id(texture) not in known:
+            colour = np.rint(texture.image.reshape(-1, 3).mean(axis=0)).astype(np.uint8)
+            known[id(texture)] = replace(texture, image=np.broadcast_to(colour, texture.image.shape).copy())
+        return known[id(texture)]
+
+    return _with_textures(items, paint)
+
+
+def _with_textures(items: Sequence[Item], change: Callable[[Texture], Texture]) -> list[Item]:
     def look(material: Material) -> Material:
-        upright = None if material.upright is None else turn(material.upright)
-        return replace(material, texture=turn(material.texture), upright=upright)
+        upright = None if material.upright is None else change(material.upright)
+        return replace(material, texture=change(material.texture), upright=upright)
 
     return [
         replace(item, prims=[replace(prim, faces=tuple(look(face) for face in prim.faces)) for prim in item.prims])

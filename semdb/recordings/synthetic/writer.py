@@ -26,7 +26,7 @@ from semdb.recordings.synthetic.person import CATEGORY as PERSON
 from semdb.recordings.synthetic.person import walker_for
 from semdb.recordings.synthetic.render import Lamp, bake_light, render_view
 from semdb.recordings.synthetic.room import Room, build_room
-from semdb.recordings.synthetic.scene import PackedScene, mirrored, pack, yaw_pose
+from semdb.recordings.synthetic.scene import PackedScene, mirrored, pack, plain, yaw_pose
 from semdb.recordings.synthetic.trajectory import walk
 from semdb.recordings.synthetic.visit import move_objects
 from semdb.types import Float32Array, FloatArray, ImageArray
@@ -49,7 +49,7 @@ _first_visit = lru_cache(maxsize=2)(build_room)
 
 @lru_cache(maxsize=2)
 def _scene(
-    room_seed: int, furniture_seed: int | None, desks: int, alike: bool, visit_seed: int | None
+    room_seed: int, furniture_seed: int | None, desks: int, alike: bool, is_plain: bool, visit_seed: int | None
 ) -> tuple[Room, PackedScene, tuple[int, ...]]:
     """The lit room of a first (`visit_seed` None) or second visit, and the labels of what was moved."""
     room, moved = _first_visit(room_seed, furniture_seed, desks), list[int]()
@@ -57,6 +57,8 @@ def _scene(
         room = copy.deepcopy(room)
         moved = move_objects(room, visit_seed, room_seed)
     items = mirrored(room.items) if alike else room.items
+    if is_plain:
+        items = plain(items)
     return room, bake_light(pack(items), _lamps(room)), tuple(moved)
 
 
@@ -78,7 +80,7 @@ class SyntheticSequence:
         self.camera = options.camera
         visit = options.seed if options.second_visit else None
         self.room, self._packed, self.moved = _scene(
-            options.room_seed, options.furniture_seed, options.desks, options.alike, visit
+            options.room_seed, options.furniture_seed, options.desks, options.alike, options.plain, visit
         )
         self._walker = walker_for(self.room, options.seed) if options.person else None
         # one more pose than frames: the blur of the last frame needs where the camera goes next

@@ -1,0 +1,206 @@
+"""A query's depth laid on the surfaces of keyframes: a pose where keypoints are few, or lie.
+
+Point to plane (Chen and Medioni, ICRA 1991) with projective association, and grey values beside (Kerl, Sturm and
+Cremers, IROS 2013), coarse to fine, on several keyframes at once. What the surfaces leave free - along a bare wall,
+about the axis of a column - shows in the information matrix.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semdb.geometry import pose_error, so3_exp, transform_points
+from semdb.localization.surfaces import Surfaces
+from semdb.types import FloatArray
+
+LONGEST_STEP = 0.1  # metres and radians together
+STILL = 2e-5
+_GREY = slice(7, 13)  # of what is counted, as in surface_kernels
+SAME_M, SAME_DEG = 0.03, 1.5  # poses nearer than this are one
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """Some steps on one level: what is further than `gate_m` off is left out, `floor_m` adds to the sensor's noise."""
+
+    level: int
+    gate_m: float
+    floor_m: float
+    steps: int
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceOptions:
+    """`coarse` rounds tell starts apart, `fine` ones finish the best."""
+
+    starts: int = 5  # keyframes from whose poses it is looked for, beside the pose of the keypoints
+    keyframes: int = 4  # on which it is laid
+    finished: int = 3  # poses that the fine rounds are spent on
+    grey_sigma: float = 12.0  # of 255
+    coarse: tuple[Round, ...] = (Round(1, 0.30, 0.02, 8), Round(1, 0.15, 0.01, 8))
+    fine: tuple[Round, ...] = (Round(0, 0.06, 0.004, 6),)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedSurfaces:
+    """Surfaces of a keyframe in the world: points and normals ``[n, 3]`` of each level."""
+
+    keyframe_id: int
+    surfaces: Surfaces
+    points: tuple[FloatArray, ...]
+    normals: tuple[FloatArray, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceFit:
+    """A pose, and how the surfaces agree with it; shares are of the points that the query has a depth for.
+
+    `information` ``[6, 6]`` is of translation (m, world) and rotation (rad, left perturbation in the world), as if
+    every point were independent.
+    """
+
+    world_from_camera: FloatArray
+    information: FloatArray
+    seen: int
+    near: float  # lie where the query measured them
+    alike: float  # look as they do in the query
+    occluded: float  # the query measured something before them
+    through: float  # it looked through them
+    correlation: float  # of grey values, over all keyframes
+    detail: float  # the same of what is left of them without the light
+
+    @property
+    def score(self) -> float:
+        """For telling starts apart: geometry and looks together, less what contradicts."""
+        return self.near + self.alike - 2 * self.through
+
+
+def place(keyframe_id: int, surfaces: Surfaces, world_from_camera: FloatArray) -> PlacedSurfaces:
+    """`surfaces` of a keyframe moved to the world."""
+    turn = world_from_camera[:3, :3].T
+    return PlacedSurfaces(
+        keyframe_id,
+        surfaces,
+        tuple(transform_points(world_from_camera, level.points) for level in surfaces),
+        tuple(np.ascontiguousarray(level.normals @ turn) for level in surfaces),
+    )
+
+
+def fit_surfaces(
+    query: Surfaces,
+    keyframes: Sequence[PlacedSurfaces],
+    start: FloatArray,
+    rounds: Sequence[Round],
+    options: SurfaceOptions,
+) -> SurfaceFit | None:
+    """The pose near `start` ``[4, 4]`` (world_from_camera) at which the query's surfaces lie on those of `keyframes`.
+
+    None where nothing overlaps.
+    """
+    pose = start
+    last = rounds[-1]
+    tones = np.tile([1.0, 0.0], (len(keyframes), 1))  # gain and bias of each keyframe's grey values
+    for now in rounds:
+        tones = _tones(_linearise(query, keyframes, pose, now, tones, options, use_grey=False)[2], tones)
+        for _ in range(now.steps):
+            matrix, gradient, counts = _linearise(query, keyframes, pose, now, tones, options, use_grey=True)
+            damping = 1e-6 * float(np.trace(matrix)) / 6 + 1e-6
+            step = -np.linalg.solve(matrix + damping * np.eye(6), gradient)
+            size = float(np.linalg.norm(step))
+            pose = _moved(pose, step * min(1.0, LONGEST_STEP / max(size, 1e-12)))
+            tones = _tones(counts, tones)
+            if size < STILL:
+                break
+    matrix, _, counts = _linearise(query, keyframes, pose, last, tones, options, use_grey=True)
+    return _fit(pose, matrix, counts)
+
+
+def distinct(fits: Sequence[SurfaceFit]) -> list[list[SurfaceFit]]:
+    """`fits` in groups of one pose each, best score first in each and among them."""
+    groups: list[list[SurfaceFit]] = []
+    for fit in sorted(fits, key=lambda fit: -fit.score):
+        for group in groups:
+            distance, angle = pose_error(fit.world_from_camera, group[0].world_from_camera)
+            if distance < SAME_M and angle < SAME_DEG:
+                group.append(fit)
+                break
+        else:
+            groups.append([fit])
+    return groups
+
+
+def _linearise(
+    query: Surfaces,
+    keyframes: Sequence[PlacedSurfaces],
+    pose: FloatArray,
+    now: Round,
+    tones: FloatArray,
+    options: SurfaceOptions,
+    *,
+    use_grey: bool,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Normal equations ``[6, 6]``, ``[6]`` and what was counted ``[k, COUNTS]`` of each keyframe."""
+    from semdb.localization.surface_kernels import COUNTS, accumulate
+
+    matrix, gradient, counts = np.zeros((6, 6)), np.zeros(6), np.zeros((len(keyframes), COUNTS))
+    level = min(now.level, len(query) - 1)
+    target = query[level]
+    for k, keyframe in enumerate(keyframes):
+        at = min(level, len(keyframe.surfaces) - 1)
+        source = keyframe.surfaces[at]
+        accumulate(
+            keyframe.points[at], keyframe.normals[at], source.point_grey, source.point_detail,
+            source.point_variance + now.floor_m**2, target.depth, target.grey, target.detail, target.variance,
+            target.intrinsics, pose,
+            now.gate_m, tones[k, 0], tones[k, 1], options.grey_sigma**2, use_grey, matrix, gradient, counts[k],
+        )  # fmt: skip
+    return np.triu(matrix) + np.triu(matrix, 1).T, gradient, counts
+
+
+def _tones(counts: FloatArray, known: FloatArray) -> FloatArray:
+    """Gain and bias ``[k, 2]`` from a keyframe's grey values to the query's; `known` where few are seen."""
+    weight, k, q, kk, qk, _ = counts[:, _GREY].T
+    safe = np.maximum(weight, 1.0)
+    variance, covariance = kk / safe - (k / safe) ** 2, qk / safe - k * q / safe**2
+    gain = np.clip(covariance / np.maximum(variance, 1e-6), 0.5, 2.0)
+    return np.where((weight > 50)[:, None], np.column_stack([gain, (q - gain * k) / safe]), known)
+
+
+def _fit(pose: FloatArray, matrix: FloatArray, counts: FloatArray) -> SurfaceFit | None:
+    from semdb.localization.surface_kernels import ALIKE, DETAIL_FIRST, NEAR, OCCLUDED, SEEN, THROUGH
+
+    total = counts.sum(axis=0)
+    seen = int(total[SEEN])
+    if not seen or not np.isfinite(pose).all():
+        return None
+    return SurfaceFit(
+        world_from_camera=pose,
+        information=matrix,
+        seen=seen,
+        near=float(total[NEAR] / seen),
+        alike=float(total[ALIKE] / seen),
+        occluded=float(total[OCCLUDED] / seen),
+        through=float(total[THROUGH] / seen),
+        correlation=_correlation(counts),
+        detail=float(total[DETAIL_FIRST + 1] / np.sqrt(max(total[DETAIL_FIRST] * total[DETAIL_FIRST + 2], 1e-9))),
+    )
+
+
+def _correlation(counts: FloatArray) -> float:
+    """Of the grey values of all keyframes with the query's, each about its own mean."""
+    weight, k, q, kk, qk, qq = counts[counts[:, _GREY.start] > 50][:, _GREY].T
+    own, theirs = (kk - k * k / weight).sum(), (qq - q * q / weight).sum()
+    both = (qk - q * k / weight).sum()
+    return float(both / np.sqrt(max(float(own * theirs), 1e-9)))
+
+
+def _moved(pose: FloatArray, step: npt.NDArray[np.floating[Any]]) -> FloatArray:
+    moved = pose.copy()
+    moved[:3, :3] = so3_exp(step[3:]) @ pose[:3, :3]
+    moved[:3, 3] += step[:3]
+    return moved
