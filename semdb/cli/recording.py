@@ -90,7 +90,7 @@ def check_lines(report: Report | None) -> list[str]:
     for finding in report.findings:
         mend = f"; {finding.option}" if finding.option else ""
         rows.append(("certain" if finding.certain else "likely", f"{finding.message}{mend}"))
-    if not report.findings:
+    if not report.findings and report.floor_px == report.floor_px:
         rows.append(("", "nothing contradicts the images"))
     return [f"{label:<12} {text}" for label, text in rows]
 
@@ -224,7 +224,7 @@ def as_lines(recording: Recording, quick: bool) -> list[str]:
     rows = [
         ("recording", f"{recording.name} ({recording.format}) in {recording.path}"),
         ("frames", f"{found['frames']}, usable {found['usable']} ({triples})"),
-        ("dropped", f"{len(dropped)}{' (images were not decoded: --quick)' if quick else ''}"),
+        ("dropped", f"{len(dropped)}{' (not every image was decoded)' if quick else ''}"),
         *(("", line) for line in group_dropped(dropped)),
         *(("look at", line) for line in group_dropped(recording.remarks)),
         ("camera", describe_camera(recording.camera)),

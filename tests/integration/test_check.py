@@ -317,3 +317,11 @@ def test_no_rendered_room_with_noise_is_suspected(tmp_path: Path, seed: int) -> 
     )
     write_synthetic_recording(tmp_path / "room", options)
     assert check_recording(open_recording(tmp_path / "room")).findings == ()
+
+
+def test_where_nothing_could_be_checked_nothing_is_said_to_fit(tmp_path: Path) -> None:
+    from semdb.cli.recording import check_lines
+
+    nothing = Report((), 2, float("nan"), float("nan"), ("only 2 pairs of frames: nothing was checked",))
+    assert not any("nothing contradicts" in line for line in check_lines(nothing))
+    assert any("nothing contradicts" in line for line in check_lines(Report((), 9, 0.5, 0.4)))
