@@ -157,6 +157,8 @@ def _recording(draft: Draft, usable: Sequence[FrameEntry], camera: Camera) -> Re
         draft.assumed.append(
             f"depth scale: {number(draft.depth_scale)} per metre ({draft.assumed_scale}); --depth-scale gives another"
         )
+    if _stands_still(usable):
+        draft.notes.append("the poses of all frames are the same: the camera does not move in them")
     return Recording(
         path=draft.path,
         name=storable(draft.name),
@@ -173,6 +175,12 @@ def _recording(draft: Draft, usable: Sequence[FrameEntry], camera: Camera) -> Re
         data=draft.data,
         contents=draft.contents,
     )
+
+
+def _stands_still(entries: Sequence[FrameEntry]) -> bool:
+    """Whether at least three frames have a pose, and all have the same."""
+    poses = [entry.world_from_camera for entry in entries if entry.world_from_camera is not None]
+    return len(poses) > 2 and all(np.abs(pose - poses[0]).max() < 1e-9 for pose in poses[1:])
 
 
 def unknown_camera(path: Path) -> RecordingError:

@@ -44,6 +44,8 @@ def choose_topics(bag: Bag, options: ReadOptions) -> Chosen:
     if color is None:
         raise RecordingError(no_images(bag, found.depth))
     depth = _choose(bag, options.depth_topic, found.depth, "--depth-topic", "depth", _depth_rank, notes)
+    if depth in found.color:
+        raise UsageError(f"--depth-topic {depth}: its images are no depth; {_has(bag, found.depth, 'depth images')}")
     infos = [topic.name for topic in bag.topics if topic.kind == INFO and topic.messages]
     if options.info_topic is not None and options.info_topic not in infos:
         raise UsageError(f"--info-topic {options.info_topic}: {_has(bag, infos, 'camera_info')}")

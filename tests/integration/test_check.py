@@ -13,7 +13,7 @@ import pytest
 
 from semdb.database.findings import list_findings
 from semdb.database.store import open_store
-from semdb.geometry import invert_pose, pose_from, quat_wxyz_from_rotation, rotation_from_quat_wxyz
+from semdb.geometry import invert_pose, pose_from, quat_wxyz_from_rotation, rotation_from_quat_wxyz, so3_exp
 from semdb.recordings import Recording, open_recording, parse_camera
 from semdb.recordings.check import Finding, Report, check_recording
 from semdb.recordings.check.pairs import look, match
@@ -96,6 +96,18 @@ def test_poses_read_wrongly_are_found_with_the_option_that_mends_them(room: Path
     assert finding.certain
     assert finding.option == option
     assert_mended(folder, finding)
+
+
+def test_poses_that_are_of_something_else(room: Path, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    folder = with_poses(
+        room, tmp_path / "walk", lambda pose: pose @ pose_from(so3_exp(rng.normal(size=3)), rng.normal(size=3))
+    )
+    finding = the_finding(open_recording(folder), "poses")
+    assert (finding.certain, finding.option) == (False, "")
+    assert float(finding.value) > 25
+    still = with_poses(room, tmp_path / "still", lambda pose: np.eye(4))
+    assert not the_finding(open_recording(still), "poses").certain
 
 
 @pytest.mark.parametrize(("factor", "value"), [(0.2, 1000), (2.0, 10000), (0.02, 100)])

@@ -265,3 +265,12 @@ def refusal(path: Path) -> str:
     for _ in recording.frames():
         pass
     return f"{path}: chunks up to byte"
+
+
+def test_colour_named_as_depth_is_refused_and_a_frame_of_the_robot_is_no_world(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "walk", Plan("bag", 4))
+    with pytest.raises(UsageError, match=r"--depth-topic /camera/color/image_raw: its images are no depth; .* it has "):
+        open_recording(bag, options=ReadOptions(depth_topic=COLOR))
+    still = open_recording(bag, options=ReadOptions(world_frame="camera_link"))
+    assert "the poses of all frames are the same: the camera does not move in them" in still.notes
+    assert not any("does not move" in note for note in open_recording(bag).notes)

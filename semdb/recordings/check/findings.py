@@ -27,6 +27,7 @@ LEAST_PAIRS = 3  # that tell anything at all
 CERTAIN_PAIRS = 4
 CERTAIN_FACTOR, LIKELY_FACTOR = 3.0, 2.0  # by which the error must fall
 LEAST_ERROR_PX = 4.0  # as read; below it nothing is wrong
+HOPELESS_PX = 25.0  # what no right recording has
 GOOD_PX, GOOD_FLOORS = 9.0, 4.0  # what a right reading reaches: so many pixels, or times the error of free motion
 IMPROVED = 0.7  # a pair is better when its error falls below this share
 SIMPLER = 1.4  # of two explanations the simpler one unless the other is better by this factor
@@ -46,8 +47,8 @@ class Finding:
     """Something that the images contradict.
 
     `kind` is ``poses_are``, ``axes``, ``quaternion``, ``depth_scale``, ``scale``, ``focal``, ``times``,
-    ``time_offset``, ``depth_time_offset`` or ``depth_registration``. `value` is what fits, `option` what mends it
-    ("" where nothing does). What is not `certain` is likely.
+    ``time_offset``, ``depth_time_offset``, ``depth_registration`` or ``poses``. `value` is what fits, `option` what
+    mends it ("" where nothing does). What is not `certain` is likely.
     """
 
     kind: str
@@ -112,6 +113,9 @@ def find(observed: Observed) -> tuple[list[Finding], float, float, list[str]]:
             found += _judge(observed, as_read, _best(observed, as_read), floor, depth)
         if not found:
             found += _turning(observed, floor, depth)
+        if not found and len(observed.pairs) >= CERTAIN_PAIRS and error >= HOPELESS_PX and floor <= GOOD_PX:
+            text = f"matches of neighbouring frames are {error:.0f} px off, and no other reading explains them"
+            found.append(Finding("poses", False, round(error, 1), "", f"poses do not fit the images: {text}"))
     if all(finding.kind == "time_offset" for finding in found):  # what is of depth alone does not depend on poses
         found += _depth_findings(observed)
     return found, error, floor, notes
