@@ -10,6 +10,7 @@ from typing import Any
 
 from semdb.database.ids import check_name
 from semdb.errors import UsageError
+from semdb.ingestion.estimation import AUTO, check_poses
 from semdb.ingestion.run import IngestOptions, Progress, open_all
 from semdb.recordings.arrays import CameraLike, as_camera, check_depth_scale
 from semdb.recordings.base import Recording
@@ -38,13 +39,15 @@ def ingest_options(
     depth_scale: float | None = None,
     *,
     check: bool = True,
+    poses: str = AUTO,
 ) -> IngestOptions:
-    """The options of an ingest. Raises UsageError for a camera or scale that is none."""
+    """The options of an ingest. Raises UsageError for a camera, scale or kind of poses that is none."""
+    check_poses(poses)
     reading = reading or AS_THE_FORMAT_SAYS
     if depth_scale is not None:
         reading = replace(reading, depth_scale=check_depth_scale(depth_scale))
     text = None if camera is None else camera_text(camera)
-    return IngestOptions(map_name, name, keyframes, stride, text, reading, check=check)
+    return IngestOptions(map_name, name, keyframes, stride, text, reading, check=check, poses=poses)
 
 
 @contextmanager

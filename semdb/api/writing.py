@@ -10,16 +10,20 @@ from typing import TYPE_CHECKING
 from semdb.api.reading import Reading
 from semdb.database.records import Deleted, RecordingStatus
 from semdb.errors import DatabaseUnavailableError, SemdbError, UsageError
+from semdb.names import storable
 
 if TYPE_CHECKING:  # the rooms behind are entered when something is asked of them: they take a second to import
     from semdb.database.copying import Copied
+    from semdb.database.pose_records import PoseOperation
     from semdb.door.protocol import Source
     from semdb.evaluation.runner import EvaluateOptions, Outcome
     from semdb.ingestion.queue import Send
     from semdb.ingestion.run import IngestOptions, IngestSummary, Progress
     from semdb.localization.query_image import PathText
     from semdb.recordings.arrays import CameraLike
+    from semdb.recordings.base import Recording
     from semdb.recordings.options import ReadOptions
+    from semdb.refinement.align import AlignReport
     from semdb.refinement.run import StepResult
 
 
@@ -47,6 +51,8 @@ class Writing(Reading):
         reading: ReadOptions | None = None,
         depth_scale: float | None = None,
         check: bool = True,
+        poses: str = "auto",
+        align: bool = False,
         progress: Progress | None = None,
     ) -> list[IngestSummary]:
         """Selects keyframes, describes and stores them; running it again adds nothing, cut off it goes on.
@@ -56,7 +62,10 @@ class Writing(Reading):
         those with the least common view, `stride` every stride-th frame, neither as many as it takes. `camera` and
         `reading` say of folders what their files do not. `depth_scale` is units per metre of depth files, or of those
         that are made of depth in memory (5000). `check` compares poses, depth, intrinsics and clocks with a sample of
-        the images first. `progress` is told what, done and total (0: not known). Makes a SQLite file that is not there.
+        the images first. `poses` are ``recorded``, ``estimated`` from images and depth, or ``auto``: recorded where
+        there are some. With `align` each recording is ingested into a map of its own name first, and moved into `map`
+        where its images show where it lies there: `alignment` of the summary says so. `progress` is told what, done and
+        total (0: not known). Makes a SQLite file that is not there.
         Returns one summary per recording.
 
         Raises RecordingError for what cannot be used at all or is certainly read wrongly, UsageError where models or
@@ -65,19 +74,48 @@ class Writing(Reading):
         from semdb.api.sources import ingest_options, open_source
         from semdb.ingestion.run import ingest_opened
 
-        options = ingest_options(map, name, keyframes, stride, camera, reading, depth_scale, check=check)
+        options = ingest_options(map, name, keyframes, stride, camera, reading, depth_scale, check=check, poses=poses)
+        if align:
+            self._check_target(map)
         with open_source(source, self.settings, options, progress, self._check_ingest) as recordings:
             store = self._store(create=True)
-            with self._here.describers() as describers:
-                return ingest_opened(
-                    recordings,
-                    store,
-                    self.settings,
-                    options,
-                    describers=describers,
-                    progress=progress,
-                    say=self._say,
-                )
+            found: list[IngestSummary] = []
+            for recording in recordings:
+                mine = self._own_map(recording, options) if align else options
+                with self._here.describers() as describers:
+                    found += ingest_opened(
+                        [recording], store, self.settings, mine, describers=describers, progress=progress, say=self._say
+                    )
+                if mine is not options and map is not None:
+                    self._bring(found[-1], map, progress)
+            return found
+
+    def _check_target(self, map: str | None) -> None:
+        if map is None:
+            raise UsageError("--align needs the map to find the recording in: --map M")
+        if not self.map(map).keyframes:
+            raise UsageError(f"the map {map!r} holds no keyframe, so nothing can be found in it: leave out --align")
+
+    def _own_map(self, recording: Recording, options: IngestOptions) -> IngestOptions:
+        """The options to ingest a recording with, before it is aligned; `options` where it is in the map already."""
+        from dataclasses import replace
+
+        there = {one.name for one in self.recordings(options.map_name)}
+        if recording.name in there:
+            return options  # run again: what is left of it is done
+        if recording.name == options.map_name:
+            raise UsageError(
+                f"the recording {recording.name!r} would be in a map of its own name first, and that is the one to "
+                "find it in: give it another name with --name"
+            )
+        return replace(options, map_name=recording.name, like=options.map_name)
+
+    def _bring(self, summary: IngestSummary, map: str, progress: Progress | None) -> None:
+        """Aligns what was ingested into a map of its own."""
+        report = self.align(summary.recording, map=map, source_map=summary.map_name, progress=progress)
+        summary.alignment = report
+        if report.convinced:
+            summary.map_name = map
 
     def queue(
         self,
@@ -91,13 +129,14 @@ class Writing(Reading):
         camera: CameraLike | None = None,
         reading: ReadOptions | None = None,
         check: bool = True,
+        poses: str = "auto",
         progress: Progress | None = None,
     ) -> list[IngestSummary]:
         """Plans recordings and sends their keyframes to workers by `send` (`semdb.workers.send_items`)."""
         from semdb.api.sources import ingest_options
         from semdb.ingestion.queue import queue_recordings
 
-        options = ingest_options(map, name, keyframes, stride, camera, reading, check=check)
+        options = ingest_options(map, name, keyframes, stride, camera, reading, check=check, poses=poses)
         return queue_recordings(
             [str(path) for path in paths],
             self.settings,
@@ -172,6 +211,78 @@ class Writing(Reading):
         info = store.find_map(map)
         give_up(store.engine, info.id, None if up is None else [value / length for value in up])
         forget(store.engine, info.id, LANDMARKS)
+
+    def align(
+        self,
+        recording: str | None = None,
+        *,
+        map: str,
+        source_map: str | None = None,
+        name: str | None = None,
+        joint: bool = False,
+        dry_run: bool = False,
+        progress: Progress | None = None,
+    ) -> AlignReport:
+        """Finds where a recording lies in `map` by localizing its keyframes there, and moves it into the map.
+
+        `source_map` says which map it is in, where several have it; without `recording` all recordings of `source_map`
+        move, as they lie to each other. `name` is the recording's in the map. With `joint` the map's own keyframes may
+        move too. All poses change in one transaction, `undo_align` brings them back; nothing changes with `dry_run`,
+        or where the report is not `convinced`. Raises NotFoundError, UsageError, ProvenanceError, DatabaseError.
+        """
+        from semdb.refinement.align import align_recordings
+
+        store = self._store()
+        target = store.find_map(map)
+        return align_recordings(
+            store,
+            self._to_align(recording, source_map, target.id),
+            target,
+            name=None if name is None else storable(name),
+            joint=joint,
+            dry_run=dry_run,
+            settings=self.settings,
+            progress=progress,
+            say=self._say,
+        )
+
+    def _to_align(self, recording: str | None, source_map: str | None, target: int) -> list[RecordingStatus]:
+        if recording is None:
+            if source_map is None:
+                raise UsageError("say what to align: a recording, or with source_map= (--from) all of a map")
+            found = self.recordings(source_map)
+            if not found:
+                raise UsageError(f"the map {source_map!r} holds no recording")
+            return found
+        if source_map is None:
+            elsewhere = [one for one in self.recordings() if one.name == storable(recording) and one.map_id != target]
+            if len(elsewhere) == 1:  # that of the map itself is not meant
+                return elsewhere
+        return [self.recording(recording, source_map)]
+
+    def undo_align(self, recording: str | None = None, *, map: str | None = None) -> PoseOperation:
+        """Takes back what moved a recording last (of `map`, where several have it), or moved anything of `map`.
+
+        Returns what was taken back. Raises UsageError where there is nothing, or keyframes were moved again since;
+        NotFoundError, DatabaseError.
+        """
+        from semdb.database.undoing import list_operations, undo
+
+        store = self._store()
+        if recording is not None:
+            key = self.recording(recording, map).recording_id
+            done = list_operations(store.engine, recording_id=key)
+            what = f"the recording {recording!r}"
+        elif map is not None:
+            done = list_operations(store.engine, self._map_id(map))
+            what = f"the map {map!r}"
+        else:
+            raise UsageError("say what to take back: a recording, or the last change of poses of a map (--map)")
+        open_ones = [one for one in done if one.undone_at is None]
+        if not open_ones:
+            raise UsageError(f"nothing has moved {what}, or all of it was taken back")
+        undo(store.engine, open_ones[0])
+        return open_ones[0]
 
     def delete(
         self,

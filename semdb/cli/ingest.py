@@ -59,6 +59,13 @@ def command(
         bool,
         typer.Option("--no-check", help="Do not look first whether images fit what the recording says of itself."),
     ] = False,
+    poses: Annotated[
+        str,
+        typer.Option("--poses", metavar="WHAT", help="recorded, estimated from images and depth, or auto (default)."),
+    ] = "auto",
+    align: Annotated[
+        bool, typer.Option("--align", help="Find out where it lies in the map, and move it there.")
+    ] = False,
     queue: Annotated[
         bool, typer.Option("--queue", help="Plan here, and let workers do it: see semdb.workers.")
     ] = False,
@@ -85,6 +92,8 @@ def command(
             "--keyframes": keyframes,
             "--stride": stride,
             "--camera": camera,
+            "--align": align or None,
+            "--poses": None if poses == "auto" else poses,
             **{option_of(name): value for name, value in reading.given().items()},
         }
         given = [word for word, value in chosen.items() if value not in (None, [])]
@@ -96,8 +105,10 @@ def command(
         return
     if not paths:
         raise UsageError("name the folder of a recording: semdb ingest PATH (or --resume for what workers have left)")
+    if queue and align:
+        raise UsageError("--align needs keyframes, which --queue leaves to workers: run semdb align when they are done")
     with StagedProgress() as progress, ends_when_told(), open_database(settings) as database:
-        work = partial(database.queue, paths, _send()) if queue else partial(database.ingest, paths)
+        work = partial(database.queue, paths, _send()) if queue else partial(database.ingest, paths, align=align)
         summaries = work(
             map=map_name,
             name=name,
@@ -106,6 +117,7 @@ def command(
             camera=camera,
             reading=reading,
             check=not no_check,
+            poses=poses,
             progress=progress.update,
         )
     if queue and not json:
@@ -115,7 +127,8 @@ def command(
     else:
         for position, summary in enumerate(summaries):
             print_lines(*[""] * (position > 0), *as_lines(summary))
-    if any(summary.failed for summary in summaries):
+    lost = [summary for summary in summaries if summary.alignment is not None and not summary.alignment.convinced]
+    if lost or any(summary.failed for summary in summaries):
         raise typer.Exit(1)
 
 
@@ -153,10 +166,14 @@ def queued_text(summary: IngestSummary) -> str:
 
 def as_json(summary: IngestSummary) -> dict[str, object]:
     """What `--json` prints for one recording."""
+    from semdb.cli.align import as_json as alignment_json
+
     return {
         "map": summary.map_name,
         "recording": summary.recording,
         "recording_id": summary.recording_id,
+        "poses": summary.pose_source,
+        "alignment": None if summary.alignment is None else alignment_json(summary.alignment),
         "frames": summary.total_frames,
         "usable": summary.usable_frames,
         "keyframes": summary.planned,
@@ -196,15 +213,18 @@ def _described(summary: IngestSummary) -> list[str]:
 
 def as_lines(summary: IngestSummary) -> list[str]:
     """What is printed for people."""
+    from semdb.cli.align import as_lines as alignment_lines
     from semdb.cli.recording import group_dropped
 
+    alignment = [] if summary.alignment is None else alignment_lines(summary.alignment)
     seconds = summary.seconds
     rate = (
         f", {measure(summary.stored / seconds['total'], 1)} keyframes/s" if summary.stored and seconds["total"] else ""
     )
     stages = ", ".join(f"{name} {seconds[name]:.1f}" for name in ("read", "detect", "encode", "features", "store"))
     return [
-        f"recording  {summary.recording} in map {summary.map_name}",
+        f"recording  {summary.recording} in map {summary.map_name}"
+        + (", estimated poses" if summary.pose_source == "estimated" else ""),
         f"frames     {summary.total_frames}, usable {summary.usable_frames}, dropped {len(summary.dropped)}",
         *(f"           {line}" for line in group_dropped(summary.dropped)),
         f"keyframes  {summary.planned} planned, {summary.stored} stored now, {summary.already_stored} stored before"
@@ -215,4 +235,5 @@ def as_lines(summary: IngestSummary) -> list[str]:
         *_described(summary),
         f"models     {', '.join(model.name for model in summary.models)}",
         f"seconds    {seconds['total']:.1f}{rate}; selection {seconds['select']:.1f}; {stages}",
+        *alignment,
     ]

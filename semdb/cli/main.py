@@ -33,6 +33,7 @@ COMMANDS: dict[str, str] = {
     "retry": "semdb.cli.status:retry",
     "delete": "semdb.cli.delete",
     "refine": "semdb.cli.refine",
+    "align": "semdb.cli.align",
     "loops": "semdb.cli.loops",
     "localize": "semdb.cli.localize",
     "evaluate": "semdb.cli.evaluate",

@@ -113,11 +113,13 @@ def replace_refinement(
     engine: Engine,
     map_id: int,
     kind: str,
-    state: str,
+    state: str | None,
     parameters: Mapping[str, Any],
     write: Callable[[Connection], int],
 ) -> int:
     """Replace the result of one step in one transaction; `write` replaces its rows and returns how many there are.
+
+    `state` is what the map held when it was read; None: what it holds when `write` is done, which changes it.
 
     Of two that run at once one waits for the other. Raises NotFoundError when the map is gone; IntegrityError when
     `write` refers to what was deleted meanwhile.
@@ -128,7 +130,7 @@ def replace_refinement(
             raise NotFoundError(f"the map {map_id} was deleted while it was refined")
         key = (refinements.c.map_id == map_id) & (refinements.c.kind == kind)
         values = {
-            "map_state": state,
+            "map_state": state or "",
             "parameters": json.dumps(dict(parameters), sort_keys=True),
             "computed_at": func.current_timestamp(),
             "row_count": 0,
@@ -137,7 +139,8 @@ def replace_refinement(
         if connection.execute(update(refinements).where(key).values(values)).rowcount == 0:
             connection.execute(insert(refinements).values(map_id=map_id, kind=kind, **values))
         rows = write(connection)
-        connection.execute(update(refinements).where(key).values(row_count=rows))
+        after = {} if state is not None else {"map_state": _map_state(connection, map_id)}
+        connection.execute(update(refinements).where(key).values(row_count=rows, **after))
         return rows
 
     try:

@@ -366,7 +366,7 @@ class Store:
         self,
         map_id: int,
         kind: str,
-        state: str,
+        state: str | None,
         parameters: Mapping[str, Any],
         write: Callable[[Connection, int, Any], int],
         result: Any,

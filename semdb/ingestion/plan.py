@@ -35,14 +35,15 @@ class Choice:
 def fingerprint(recording: Recording, keyframes: Sequence[FrameEntry]) -> str:
     """SHA-256 over format, camera and the keyframes' names, times and poses: tells recordings of one name apart.
 
-    Other frames are not in it, so a recording whose broken files were mended is still the same one.
+    Other frames are not in it, so a recording whose broken files were mended is still the same one; nor are estimated
+    poses, which its plan keeps.
     """
     digest = hashlib.sha256(f"{recording.format}|{recording.camera}|{recording.depth_scale}".encode())
     for entry in keyframes:
         digest.update(f"|{entry.index}|{entry.name}|{entry.timestamp_ns}".encode(errors="surrogateescape"))
         if entry.camera is not None:
             digest.update(f"|{entry.camera}".encode())
-        if entry.world_from_camera is not None:
+        if entry.world_from_camera is not None and not recording.estimated:
             digest.update(entry.world_from_camera.astype("<f8").tobytes())
     return digest.hexdigest()
 

@@ -14,9 +14,12 @@ from dataclasses import dataclass, field
 from semdb.database import items
 from semdb.database.items import OpenItem, open_items
 from semdb.database.planning import StoredPlan, check_models, stored_plan
+from semdb.database.pose_records import PoseSource
+from semdb.database.pose_sources import load_planned_poses, recording_poses
 from semdb.database.requeue import requeue_failed
 from semdb.database.store import Store, open_store
 from semdb.errors import ModelError, NotFoundError, RecordingError, RecordingUnavailableError, UsageError
+from semdb.ingestion.estimation import posed, with_poses
 from semdb.ingestion.plan import fingerprint
 from semdb.ingestion.run import (
     IngestOptions,
@@ -66,10 +69,11 @@ def queue_recordings(
             for note in (*recording.said, *specs.notes):
                 if say is not None:
                     say(f"{recording.name}: {note}")
-            warnings = look_first(recording, opened, settings, options, progress, say)
+            posed_so = posed(recording, opened, options.map_of(recording), options.poses, progress=progress, say=say)
+            warnings = look_first(posed_so.recording, opened, settings, options, progress, say)
             one = settings_of_map(settings, known).model_copy(update={"threads": 1})
             models = make_describers(specs, one)[0].models
-            summary, _ = plan_ingest(recording, opened, models, options, progress=progress)
+            summary, _ = plan_ingest(posed_so, opened, models, options, progress=progress)
             summary.notes = (*recording.said, *specs.notes)
             keep_findings(opened, summary, warnings)
             requeue_failed(opened.engine, summary.recording_id)
@@ -193,7 +197,7 @@ class Workplace:
         note: Callable[[Item], None],
     ) -> None:
         """Until nothing of `found` is free: a claim whose commit was answered by nobody is only seen when it ended."""
-        recording = self._recording(plan)
+        recording = self._recording(store, plan)
         describers = self._describers_of(store, plan, recording)
         frames = [item.frame_index for item in found]
         progress = True
@@ -219,7 +223,7 @@ class Workplace:
                     return
             found = open_items(store.engine, plan.recording_id, frames)
 
-    def _recording(self, plan: StoredPlan) -> Recording:
+    def _recording(self, store: Store, plan: StoredPlan) -> Recording:
         key = (plan.recording_id, plan.source, plan.fingerprint)
         if self._opened is not None and self._opened[0] == key and self._opened[1].path.exists():
             return self._opened[1]
@@ -235,6 +239,8 @@ class Workplace:
         if len(opened) != 1:
             raise RecordingError(f"{folder}: on this machine there are {len(opened)} recordings, and one was planned")
         recording = opened[0]
+        if recording_poses(store.engine, plan.recording_id).source is PoseSource.ESTIMATED:
+            recording = with_poses(recording, load_planned_poses(store.engine, plan.recording_id))
         known = {entry.index: entry for entry in recording.entries}
         entries = [known[index] for index in plan.frame_indexes if index in known]
         if len(entries) == len(plan.frame_indexes) and fingerprint(recording, entries) != plan.fingerprint:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from semdb.database import items
 from semdb.database.findings import write_findings
@@ -21,6 +22,7 @@ from semdb.database.requeue import requeue_failed
 from semdb.database.store import Store, open_store
 from semdb.errors import UsageError
 from semdb.ingestion.contradictions import check_before_ingest
+from semdb.ingestion.estimation import AUTO, Posed, posed
 from semdb.ingestion.plan import Choice, choose_keyframes, fingerprint
 from semdb.ingestion.work import STAGES, Item, log_item, work_off
 from semdb.names import storable
@@ -34,6 +36,9 @@ from semdb.recordings.source import locate, open_located, write_source
 from semdb.settings import Settings
 from semdb.types import ModelInfo
 
+if TYPE_CHECKING:
+    from semdb.refinement.align import AlignReport
+
 Progress = Callable[[str, int, int], None]  # what, done, total
 Describers = dict[object, list[Describer]]  # by all that makes them what they are
 MOST_DESCRIBERS = 4  # each holds networks of its own
@@ -46,7 +51,8 @@ class IngestOptions:
 
     `map_name` None gives each recording the map of `default_map_name`. `camera` is the text of ``--camera``,
     `reading` says of the files what they do not say, `check` whether that is compared with the images first;
-    `descriptor_dtype` is how descriptors of float are stored.
+    `descriptor_dtype` is how descriptors of float are stored. `poses` are ``recorded``, ``estimated``, or ``auto``:
+    recorded where there are some. `like` names a map whose models describe a map that has none yet.
     """
 
     map_name: str | None = None
@@ -57,6 +63,8 @@ class IngestOptions:
     reading: ReadOptions = AS_THE_FORMAT_SAYS
     check: bool = True
     descriptor_dtype: str = "float32"
+    poses: str = AUTO
+    like: str | None = None
 
     def map_of(self, recording: Recording) -> str:
         """The map that `recording` goes into."""
@@ -81,6 +89,8 @@ class IngestSummary:
     planned: int
     already_stored: int
     models: tuple[ModelInfo, ...]
+    pose_source: str = "recorded"
+    alignment: AlignReport | None = None  # where it was to be found in another map
     stored: int = 0
     elsewhere: int = 0
     objects: int = 0
@@ -132,11 +142,15 @@ def ingest_opened(
     summaries: list[IngestSummary] = []
     for recording in recordings:
         has_masks = recording.categories is not None
-        specs, own = describers_for(options.map_of(recording), has_masks, store, settings, describers)
+        of_map = options.map_of(recording)
+        if options.like is not None and not map_models_of(store, of_map):
+            of_map = options.like
+        specs, own = describers_for(of_map, has_masks, store, settings, describers)
         for note in (*recording.said, *specs.notes):
             (say or _nobody)(f"{recording.name}: {note}")
-        warnings = look_first(recording, store, settings, options, progress, say)
-        summary = ingest_recording(recording, store, own, options, progress=progress)
+        known = posed(recording, store, options.map_of(recording), options.poses, progress=progress, say=say)
+        warnings = look_first(known.recording, store, settings, options, progress, say)
+        summary = ingest_recording(known, store, own, options, progress=progress)
         summary.notes = (*recording.said, *specs.notes)
         keep_findings(store, summary, warnings)
         summaries.append(summary)
@@ -171,7 +185,7 @@ def look_first(
 
     One that is planned already was looked at then. Raises RecordingError for what is certainly wrong.
     """
-    if not (options.check and settings.check_recordings):
+    if recording.estimated or not (options.check and settings.check_recordings):
         return None
     if store.planned_frames(options.map_of(recording), recording.name):
         return None
@@ -225,7 +239,7 @@ def make_describers(specs: ModelSpecs, settings: Settings) -> list[Describer]:
 
 
 def ingest_recording(
-    recording: Recording,
+    source: Recording | Posed,
     store: Store,
     describer: Describer | Sequence[Describer],
     options: IngestOptions,
@@ -240,7 +254,9 @@ def ingest_recording(
     """
     describers = (describer,) if isinstance(describer, Describer) else tuple(describer)
     started = time.perf_counter()
-    summary, todo = plan_ingest(recording, store, describers[0].models, options, progress=progress, entries=entries)
+    known = source if isinstance(source, Posed) else Posed(source)
+    recording = known.recording
+    summary, todo = plan_ingest(known, store, describers[0].models, options, progress=progress, entries=entries)
     selected = time.perf_counter()
     summary.seconds = {"select": selected - started, **dict.fromkeys(STAGES, 0.0)}
     requeue_failed(store.engine, summary.recording_id)
@@ -268,7 +284,7 @@ def ingest_recording(
 
 
 def plan_ingest(
-    recording: Recording,
+    source: Recording | Posed,
     store: Store,
     models: tuple[ModelInfo, ...],
     options: IngestOptions,
@@ -281,6 +297,8 @@ def plan_ingest(
     Returns a summary of which nothing is done yet, and how many keyframes are to be done. Raises as
     `Store.plan_recording` does.
     """
+    known = source if isinstance(source, Posed) else Posed(source)
+    recording = known.recording
     map_name = options.map_of(recording)
     check_models(map_models_of(store, map_name), models, f"the map {map_name!r}")
     if entries is None:
@@ -290,7 +308,7 @@ def plan_ingest(
         )
     else:
         choice = Choice(entries)
-    plan = _plan(recording, store, map_name, models, choice)
+    plan = _plan(known, store, map_name, models, choice)
     summary = IngestSummary(
         map_name=map_name,
         recording=recording.name,
@@ -300,6 +318,7 @@ def plan_ingest(
         planned=len(choice.entries),
         already_stored=len(plan.stored),
         models=models,
+        pose_source="estimated" if recording.estimated else "recorded",
         dropped=(*recording.dropped, *recording.decode_failures),
     )
     return summary, len(plan.pending)
@@ -336,9 +355,8 @@ def map_models_of(store: Store, map_name: str) -> tuple[ModelInfo, ...]:
     return ()
 
 
-def _plan(
-    recording: Recording, store: Store, map_name: str, models: tuple[ModelInfo, ...], choice: Choice
-) -> PlannedRecording:
+def _plan(known: Posed, store: Store, map_name: str, models: tuple[ModelInfo, ...], choice: Choice) -> PlannedRecording:
+    recording = known.recording
     plan = RecordingPlan(
         name=recording.name,
         format=recording.format,
@@ -347,6 +365,7 @@ def _plan(
         fingerprint=fingerprint(recording, choice.entries),
         frame_indexes=tuple(entry.index for entry in choice.entries),
         extends=choice.extends,
+        poses=known.planned(choice.entries),
     )
     return store.plan_recording(store.ensure_map(map_name), plan, models)
 

@@ -116,6 +116,7 @@ class Recording:
     reading: ReadOptions = AS_THE_FORMAT_SAYS  # what was said by hand of how it is to be read
     takes: frozenset[str] = frozenset()  # the options that mean something to its format
     world_turn: FloatArray | None = None  # by which poses were turned to have z up
+    estimated: bool = False  # poses are semdb's: no part of what the recording is
     contents: tuple[str, ...] = ()  # what else the file holds and what is taken of it, a line each for people
     decode_failures: list[DroppedFrame] = field(default_factory=list)
     remarks: list[DroppedFrame] = field(default_factory=list)

@@ -126,7 +126,7 @@ def _read_poses(path: Path, notes: list[str], options: ReadOptions) -> dict[int,
     if not files and any(path.glob(MATRICES)):
         return _read_matrices(path, options)
     if not files:
-        notes.append(f"no {POSES}: the frames have no pose and cannot become keyframes")
+        notes.append(f"no {POSES}: the frames have no pose")
         return None
     if len(files) > 1:
         names = ", ".join(file.name for file in files)

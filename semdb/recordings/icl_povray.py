@@ -84,7 +84,7 @@ def open_povray(path: Path, camera: Camera | None = None, options: ReadOptions |
     if right:
         draft.assumed.append("poses: POV-Ray's world is left-handed with y up, as ICL-NUIM's, and is mirrored")
     else:
-        draft.notes.append("no scene_*.txt: the frames have no pose and cannot become keyframes")
+        draft.notes.append("no scene_*.txt: the frames have no pose")
     if why:
         draft.assumed.append(why)
     if not depth:

@@ -68,7 +68,7 @@ def open_kapture(path: Path, camera: Camera | None = None, options: ReadOptions 
     if not usable:
         notes.append("no depth files that are listed and there: the frames have no depth")
     if not poses:
-        notes.append("no poses in trajectories.txt: the frames have no pose and cannot become keyframes")
+        notes.append("no poses in trajectories.txt: the frames have no pose")
     by_time: dict[int, list[_Record]] = {}
     for record in usable:
         by_time.setdefault(record.time, []).append(record)

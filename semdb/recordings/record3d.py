@@ -58,7 +58,7 @@ def open_record3d(path: Path, camera: Camera | None = None, options: ReadOptions
     own_cameras = None if camera is not None else _own_cameras(metadata, known)
     notes, entries, dropped = [], [], []
     if not poses:
-        notes.append("metadata has no poses: the frames have no pose and cannot become keyframes")
+        notes.append("metadata has no poses: the frames have no pose")
     with_depth = any(f"rgbd/{number}.depth" in members.names for number in numbers)
     if not with_depth:
         notes.append("no rgbd/N.depth: the frames have no depth")

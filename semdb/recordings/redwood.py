@@ -96,7 +96,7 @@ def _poses(
 ) -> dict[int, FloatArray | str] | None:
     logs = _logs(path)
     if not logs:
-        notes.append("no trajectory .log: the frames have no pose and cannot become keyframes")
+        notes.append("no trajectory .log: the frames have no pose")
         return None
     if len(logs) > 1:
         names = ", ".join(str(log.relative_to(path)) for log in logs)

@@ -73,10 +73,9 @@ class CameraPoses:
 def _no_poses(tree: TransformTree, frame: str) -> str:
     frames = tree.frames()
     if not frames:
-        return "no /tf, odometry or poses: the frames have no pose and cannot become keyframes"
+        return "no /tf, odometry or poses: the frames have no pose"
     return (
-        f"no transform moves the camera's frame {frame!r} (there are {', '.join(frames[:12])}): the frames have no "
-        "pose and cannot become keyframes"
+        f"no transform moves the camera's frame {frame!r} (there are {', '.join(frames[:12])}): the frames have no pose"
     )
 
 

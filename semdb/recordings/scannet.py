@@ -129,7 +129,7 @@ def open_scannet_folder(path: Path, camera: Camera | None = None, options: ReadO
     if not depth:
         notes.append("no images in depth/: the frames have no depth")
     if not poses:
-        notes.append("no files in pose/: the frames have no pose and cannot become keyframes")
+        notes.append("no files in pose/: the frames have no pose")
     color_size = _size_of(entries, [entry.image_path for entry in entries])
     known = _matrix_camera(path / "intrinsic" / INTRINSIC_COLOR, color_size)
     scale = options.depth_scale or DEPTH_SCALE

@@ -72,7 +72,7 @@ def open_seven_scenes(path: Path, camera: Camera | None = None, options: ReadOpt
     if not has_depth:
         draft.notes.append("no frame-*.depth.png: the frames have no depth")
     if not has_poses:
-        draft.notes.append("no frame-*.pose.txt: the frames have no pose and cannot become keyframes")
+        draft.notes.append("no frame-*.pose.txt: the frames have no pose")
     for number, parts in sorted(files.items()):
         if not is_wanted(parts.get("color", ""), len(draft.entries)):
             continue

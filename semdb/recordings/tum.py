@@ -140,7 +140,7 @@ def _read_depth_list(
 
 def _read_poses(path: Path, notes: list[str], options: ReadOptions, times_ns: Sequence[int]) -> Trajectory | None:
     if not os.path.lexists(path / "groundtruth.txt"):
-        notes.append("no groundtruth.txt: the frames have no pose and cannot become keyframes")
+        notes.append("no groundtruth.txt: the frames have no pose")
         return None
     trajectory, pose_notes = read_trajectory(path / "groundtruth.txt", options, times_ns)
     notes += pose_notes

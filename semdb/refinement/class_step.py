@@ -23,6 +23,8 @@ class ClassStep:
     options: ConfusionOptions = field(default_factory=ConfusionOptions)
     kind: str = refinements.CLASSES
     summary: str = "classes taken for each other"
+    by_default: bool = True
+    moves: bool = False
 
     @property
     def parameters(self) -> Mapping[str, Any]:

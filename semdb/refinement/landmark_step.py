@@ -39,6 +39,8 @@ class LandmarkStep:
     options: LandmarkOptions = field(default_factory=LandmarkOptions)
     kind: str = landmark_rows.LANDMARKS
     summary: str = "landmarks"
+    by_default: bool = True
+    moves: bool = False
 
     @property
     def parameters(self) -> Mapping[str, Any]:

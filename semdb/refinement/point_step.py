@@ -27,6 +27,8 @@ class PointStep:
     options: FusionOptions = field(default_factory=FusionOptions)
     kind: str = refinements.POINTS
     summary: str = "points that several keyframes see"
+    by_default: bool = True
+    moves: bool = False
 
     @property
     def parameters(self) -> Mapping[str, Any]:

@@ -59,12 +59,12 @@ def refine_map(
 
 
 def steps_of(kinds: Sequence[str]) -> list[Step]:
-    """The steps of these kinds, all without any. Raises UsageError for a kind that is none."""
+    """The steps of these kinds, without any all that are run by default. Raises UsageError for a kind that is none."""
     known = [step.kind for step in STEPS]
     for kind in kinds:
         if kind not in known:
             raise UsageError(f"--step {kind}: known are {', '.join(known)}")
-    return [step for step in STEPS if not kinds or step.kind in kinds]
+    return [step for step in STEPS if (step.kind in kinds if kinds else step.by_default)]
 
 
 def _run(store: Store, info: MapInfo, step: Step, progress: Progress | None) -> tuple[int, bool]:
@@ -86,11 +86,12 @@ def _run(store: Store, info: MapInfo, step: Step, progress: Progress | None) -> 
         if not same and attempt < ATTEMPTS:
             continue
         try:
-            rows = store.replace_refinement(info.id, step.kind, state, step.parameters, step.write, result)
+            before = None if step.moves else state
+            rows = store.replace_refinement(info.id, step.kind, before, step.parameters, step.write, result)
         except IntegrityError as error:  # the result refers to a keyframe that was deleted after the map was read
             failure = error
             continue
-        return rows, store.map_state(info.id) == state
+        return rows, step.moves or store.map_state(info.id) == state
     raise DatabaseError(
         f"the map {info.name!r} kept changing while it was refined ({step.summary}): run semdb refine when ingest and "
         "deletion are done"

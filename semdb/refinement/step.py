@@ -21,6 +21,14 @@ class Step(Protocol):
         """For people, in a few words."""
 
     @property
+    def by_default(self) -> bool:
+        """Whether it is run where no step is named."""
+
+    @property
+    def moves(self) -> bool:
+        """Whether it changes the poses that the state of a map is made from."""
+
+    @property
     def parameters(self) -> Mapping[str, Any]:
         """All that changes the result, beside the map: other ones make it out of date."""
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from semdb.refinement.class_step import ClassStep
 from semdb.refinement.landmark_step import LandmarkStep
 from semdb.refinement.point_step import PointStep
+from semdb.refinement.pose_step import PoseStep
 from semdb.refinement.step import Step
 
-STEPS: tuple[Step, ...] = (ClassStep(), PointStep(), LandmarkStep())
+STEPS: tuple[Step, ...] = (PoseStep(), ClassStep(), PointStep(), LandmarkStep())
 FOR_LOCALIZATION = ("classes", "points")  # the steps that answers to queries are made with

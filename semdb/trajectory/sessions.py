@@ -20,29 +20,47 @@ from semdb.trajectory.edges import Edge, EdgeArrays, EdgeKind, EdgeState, stack_
 from semdb.trajectory.pose_graph import marginal_covariances, optimise
 from semdb.types import BoolArray, FloatArray
 
+MEDIANS = ("confidence", "likeness")  # of claims
+
+
+@dataclass(frozen=True, slots=True)
+class StepNoise:
+    """Standard deviations of a step from keyframe to keyframe: at rest, and what each metre and radian adds."""
+
+    m: float
+    m_per_m: float
+    rad: float
+    rad_per_rad: float
+
 
 @dataclass(frozen=True, slots=True)
 class SessionOptions:
-    """What convinces. `step_*`: how far a recorded trajectory is off between keyframes, at rest and with the way.
+    """What convinces, and how stiff a trajectory is.
 
-    `least_agreeing` claims must agree, more than `rival_share` times as many as in any other set; of keyframes that
-    should see the same as one of the map from about the same side (within `near`, `pose_distances`), `least_share` must
-    be among them, where there are `least_near` of them.
+    `recorded` is how far recorded poses are off from step to step where the graph is solved, `drift` those that were
+    estimated, and what is granted to any when claims are compared. `least_agreeing` claims must agree, half of them
+    with a confidence of `sure` and patches that are `alike`, and `rival_share` times as many as in any other set. Of
+    keyframes that should see the same as one of the map from about the same side (within `near`, `pose_distances`, and
+    with `near_view` in common), `least_share` must be among them and look the same, where there are `least_near` of
+    them: the likeness of patches is at least `like`, and `like_falls` less at a distance of 1. A room with other
+    textures or furniture is localized from where it was seen before, and does not look the same from there.
     """
 
     least_agreeing: int = 3
+    sure: float = 0.95
+    alike: float = 0.65
+    like: float = 0.9
+    like_falls: float = 0.3
     rival_share: float = 2.0
     near: float = 1.0
     near_view: float = 0.5
     least_near: int = 4
     least_share: float = 0.5
-    step_m: float = 0.003
-    step_m_per_m: float = 0.02
-    step_rad: float = 0.003
-    step_rad_per_rad: float = 0.02
+    recorded: StepNoise = StepNoise(0.0005, 0.003, 0.0005, 0.003)
+    drift: StepNoise = StepNoise(0.003, 0.02, 0.003, 0.02)
     claim_growth: float = 2.0  # of standard deviations of localizations, in the pose graph
-    claim_m: float = 0.008  # which are believed to be no surer than that
-    claim_rad: float = 0.004
+    claim_m: float = 0.004  # which are believed to be no surer than that
+    claim_rad: float = 0.002
     consistency: ConsistencyOptions = field(default_factory=ConsistencyOptions)
 
 
@@ -59,6 +77,8 @@ class Claim:
     map_from_camera: FloatArray
     covariance: FloatArray
     inliers: int
+    confidence: float = 1.0
+    likeness: float = 1.0  # of the patches that it shares with the map's keyframes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,6 +87,8 @@ class Consensus:
 
     edges: tuple[Edge, ...]  # of each claim, from the map's keyframe to the recording's; states say which count
     agreeing: tuple[int, ...]  # numbers of the recording's keyframes
+    confidence: float  # medians over those
+    likeness: float
     rival: int  # claims of the largest other set
     map_from_recording: FloatArray | None
 
@@ -114,12 +136,14 @@ def agree(
         against = int(np.count_nonzero(~pairs[n, agreeing]))
         reason = f"contradicts {against} of {len(agreeing)}"
         edges[n] = replace(edges[n], state=EdgeState.CONTRADICTED, reason=reason)
-    middle = None
+    middle, confidence, likeness = None, 0.0, 0.0
     if agreeing:
+        kept = [claims[n] for n in agreeing]
+        confidence, likeness = (float(np.median([getattr(one, name) for one in kept])) for name in MEDIANS)
         motions = np.stack([claims[n].map_from_camera @ invert_pose(poses[claims[n].number]) for n in agreeing])
         at = poses[[claims[n].number for n in agreeing], :3, 3].mean(axis=0)
         middle = _middle(motions, at)
-    return Consensus(tuple(edges), tuple(claims[n].number for n in agreeing), rival, middle)
+    return Consensus(tuple(edges), tuple(claims[n].number for n in agreeing), confidence, likeness, rival, middle)
 
 
 def _chain(map_poses: FloatArray, poses: FloatArray, steps: FloatArray) -> Chain:
@@ -137,39 +161,50 @@ def _middle(motions: FloatArray, at: FloatArray) -> FloatArray:
     return np.asarray(motions[int(np.argmin(total))])
 
 
-def step_covariances(poses: FloatArray, options: SessionOptions | None = None) -> FloatArray:
+def step_covariances(poses: FloatArray, noise: StepNoise) -> FloatArray:
     """How far each of `poses` ``[n, 4, 4]`` may be off against the one before: right perturbations ``[n, 6, 6]``."""
-    options = options or SessionOptions()
     found = np.zeros((len(poses), 6, 6))
     for n in range(1, len(poses)):
-        found[n] = step_covariance(invert_pose(poses[n - 1]) @ poses[n], options)
+        found[n] = _step_covariance(invert_pose(poses[n - 1]) @ poses[n], noise)
     return found
 
 
-def step_covariance(step: FloatArray, options: SessionOptions) -> FloatArray:
-    """The same of one step ``[4, 4]``."""
-    metres = options.step_m + options.step_m_per_m * float(np.linalg.norm(step[:3, 3]))
+def _step_covariance(step: FloatArray, noise: StepNoise) -> FloatArray:
+    metres = noise.m + noise.m_per_m * float(np.linalg.norm(step[:3, 3]))
     turn = float(np.linalg.norm(so3_logs(step[None, :3, :3])[0]))
-    radians = options.step_rad + options.step_rad_per_rad * turn
+    radians = noise.rad + noise.rad_per_rad * turn
     return np.diag(np.repeat([metres**2, radians**2], 3))
 
 
-def convinces(consensus: Consensus, near: Sequence[int], options: SessionOptions | None = None) -> str:
+def looks_the_same(likeness: float, distance: float, options: SessionOptions) -> bool:
+    """Whether a keyframe so far (`pose_distances`) from one of the map looks as the same place does."""
+    return likeness >= options.like - options.like_falls * distance
+
+
+def convinces(
+    consensus: Consensus, near: Sequence[int], same: Sequence[int], options: SessionOptions | None = None
+) -> str:
     """Why the map is not where the recording lies, in a line; empty where it is.
 
-    `near` are numbers of keyframes that should see the same as a keyframe of the map, once both are in one frame.
+    `near` are numbers of keyframes that should see the same as a keyframe of the map, once both are in one frame, and
+    `same` those of them that are among the claims that agree, and look the same.
     """
     options = options or SessionOptions()
     agreeing, claims = len(consensus.agreeing), len(consensus.edges)
     if agreeing < options.least_agreeing:
         return f"only {agreeing} of {claims} localized keyframes agree where it lies; it takes {options.least_agreeing}"
+    if consensus.confidence < options.sure or consensus.likeness < options.alike:
+        return (
+            f"{agreeing} keyframes agree where it lies, but are not sure of it: the median of their confidence is "
+            f"{consensus.confidence:.2f} ({options.sure:g} is asked), of the likeness of what they see "
+            f"{consensus.likeness:.2f} ({options.alike:g})"
+        )
     if agreeing < options.rival_share * consensus.rival:
         return f"two places fit: {agreeing} keyframes agree on one, {consensus.rival} on another"
-    seen = len(set(near) & set(consensus.agreeing))
-    if len(near) >= options.least_near and seen < options.least_share * len(near):
+    if len(near) >= options.least_near and len(same) < options.least_share * len(near):
         return (
-            f"{agreeing} keyframes agree where it lies, but of {len(near)} that should see the same as the map there, "
-            f"only {seen} do"
+            f"{agreeing} keyframes agree where it lies, but of {len(near)} that should look the same as the map there, "
+            f"only {len(same)} do"
         )
     return ""
 

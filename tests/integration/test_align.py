@@ -1,0 +1,179 @@
+"""`semdb align`: visits of one rendered room come into one frame, other rooms do not."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from semdb.api import Answer, Database
+from semdb.errors import NotFoundError, UsageError
+from semdb.geometry import invert_pose, pose_error, pose_from, so3_exp
+from semdb.recordings import open_recordings
+from semdb.recordings.base import Recording
+from semdb.types import FloatArray
+from tests.integration.opened import Opening, opener
+from tests.rooms import SMALL, render, semdb
+
+MOTION = pose_from(so3_exp([0.4, -1.0, 2.0]), [7.0, -3.0, 1.5])
+WALK = replace(SMALL, frames=40, lap_frames=40)
+
+
+def part(path: Path, name: str, chosen: slice, motion: FloatArray = MOTION) -> Recording:
+    """Some frames of a recording, in a frame of their own."""
+    [found] = open_recordings(path)
+    entries = [replace(entry, world_from_camera=motion @ entry.world_from_camera) for entry in found.entries[chosen]]
+    return replace(found, name=name, entries=tuple(entries))
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("rooms")
+    return {
+        "room": render(folder / "room", WALK),
+        "alike": render(folder / "alike", replace(WALK, alike=True)),
+        "furniture": render(folder / "furniture", replace(WALK, furniture_seed=5)),
+    }
+
+
+@pytest.fixture(scope="module")
+def filled(rooms: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A map of every other frame of a room, the others in a frame of their own, and rooms to be confused with it."""
+    url = f"sqlite:///{tmp_path_factory.mktemp('align') / 'semdb.sqlite3'}"
+    with opener(url, tmp_path_factory.mktemp("cache")) as opening:
+        db = opening()
+        fill(db, rooms)
+        for name in ("alike", "furniture"):
+            db.ingest(part(rooms[name], name, slice(0, 40, 3)), map=name, stride=1, check=False)
+    return url
+
+
+def fill(db: Database, rooms: dict[str, Path]) -> None:
+    db.ingest(part(rooms["room"], "first", slice(0, 40, 3), np.eye(4)), map="room", stride=1, check=False)
+    db.ingest(part(rooms["room"], "second", slice(1, 40, 4)), map="own", stride=1, check=False)
+
+
+@pytest.fixture
+def db(filled: str, tmp_path: Path) -> Iterator[Database]:
+    """A copy that a test may change."""
+    copy = tmp_path / "semdb.sqlite3"
+    copy.write_bytes(Path(filled.removeprefix("sqlite:///")).read_bytes())
+    with opener(f"sqlite:///{copy}", tmp_path / "cache") as opening:
+        yield opening()
+
+
+def errors(db: Database, map: str, recording: str, motion: FloatArray, truth: dict[int, FloatArray]) -> FloatArray:
+    return np.array([pose_error(motion @ truth[one.id], one.world_from_camera) for one in db.keyframes(map, recording)])
+
+
+def ask(db: Database, folder: Path, number: int) -> Answer:
+    image = sorted((folder / "rgb").iterdir())[number]
+    return db.localize(image, map="room", like=folder)
+
+
+def poses(db: Database, map: str, recording: str) -> dict[int, FloatArray]:
+    return {one.id: one.world_from_camera for one in db.keyframes(map, recording)}
+
+
+def test_a_second_visit_comes_back_on_every_server(open_db: Opening, rooms: dict[str, Path]) -> None:
+    db = open_db()
+    fill(db, rooms)
+    before = poses(db, "own", "second")
+    asked = ask(db, rooms["room"], 2)
+    assert asked.localized
+    report = db.align("second", map="room")
+    assert report.convinced
+    assert report.operation > 0
+    assert (report.agreeing, report.rival) == (10, 0)
+    found = errors(db, "room", "second", invert_pose(MOTION), before)
+    assert np.median(found[:, 0]) < 0.002
+    assert found[:, 0].max() < 0.005
+    assert found[:, 1].max() < 0.2
+    assert [(one.name, one.keyframes) for one in db.recordings("room")] == [("first", 14), ("second", 10)]
+    assert db.recordings("own") == []
+    links = db.loops("room")
+    assert [link.kind for link in links] == ["session"] * len(links)
+    assert len(links) == 10
+    # what was open before follows, and the map that was left is empty
+    again = ask(db, rooms["room"], 1)
+    assert again.localized
+    assert any(one.recording == "second" for one in again.candidates)
+    db.undo_align("second")
+    after = poses(db, "own", "second")
+    assert after.keys() == before.keys()
+    for key, pose in before.items():
+        np.testing.assert_allclose(after[key], pose, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["alike", "furniture"])
+def test_a_room_that_looks_alike_is_refused_both_ways(db: Database, name: str) -> None:
+    before = poses(db, name, name), poses(db, "room", "first")
+    for recording, there in ((name, "room"), ("first", name)):
+        report = db.align(recording, map=there)
+        assert not report.convinced, report
+        assert report.operation == 0
+    after = poses(db, name, name), poses(db, "room", "first")
+    assert all(np.array_equal(b[key], a[key]) for b, a in zip(before, after, strict=True) for key in b)
+
+
+def test_the_command(filled: str, tmp_path: Path) -> None:
+    copy = tmp_path / "semdb.sqlite3"
+    copy.write_bytes(Path(filled.removeprefix("sqlite:///")).read_bytes())
+    url = f"sqlite:///{copy}"
+    dry = semdb("align", "second", "--map", "room", "--dry-run", url=url)
+    assert dry.returncode == 0, dry.stderr
+    assert dry.stdout.count("second/") == 10
+    assert "would move from own to room; nothing is changed" in dry.stdout
+    refused = semdb("align", "alike", "--map", "room", url=url)
+    assert refused.returncode == 1
+    assert "not moved: " in refused.stdout
+    assert "nothing is changed" in refused.stdout
+    named = semdb("align", "second", "--map", "room", "--name", "first", url=url)
+    assert named.returncode == 2
+    assert "the map 'room' has a recording 'first' already: give this one another name with --name" in named.stderr
+    done = semdb("align", "second", "--map", "room", "--name", "evening", "--json", url=url)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert (found["convinced"], found["moved"], found["agreeing"]) == (True, True, 10)
+    assert {one["verdict"] for one in found["keyframes"]} == {"localized"}
+    assert "evening" in semdb("status", url=url).stdout
+    back = semdb("align", "evening", "--undo", url=url)
+    assert back.returncode == 0, back.stderr
+    assert "took back: second is in the map own again, its poses are what they were" in back.stdout
+    again = semdb("align", "second", "--undo", url=url)
+    assert again.returncode == 2
+    assert "nothing has moved the recording 'second', or all of it was taken back" in again.stderr
+    assert semdb("align", "second", url=url).returncode == 2
+    assert "--undo takes no --name" in semdb("align", "second", "--undo", "--name", "x", url=url).stderr
+
+
+def test_maps_are_merged_and_the_map_may_move_too(db: Database) -> None:
+    before = poses(db, "own", "second")
+    report = db.align(map="room", source_map="own", joint=True)
+    assert report.convinced
+    assert report.map_shift_m < 0.005
+    assert np.median(errors(db, "room", "second", invert_pose(MOTION), before)[:, 0]) < 0.003
+    db.undo_align(map="room")
+    assert len(poses(db, "own", "second")) == 10
+
+
+def test_what_cannot_be_aligned(db: Database) -> None:
+    with pytest.raises(NotFoundError, match="there is no map 'hall'"):
+        db.align("second", map="hall")
+    with pytest.raises(NotFoundError, match="there is no recording 'third'"):
+        db.align("third", map="room")
+    with pytest.raises(UsageError, match="is in the map 'room' already"):
+        db.align("first", map="room")
+    with pytest.raises(UsageError, match="say what to align"):
+        db.align(map="room")
+    with pytest.raises(UsageError, match="say what to take back"):
+        db.undo_align()
+    db.align("second", map="room")
+    with pytest.raises(UsageError, match="the map 'own' holds no recording"):
+        db.align(map="room", source_map="own")
+    with pytest.raises(UsageError, match="the map 'own' holds no keyframe"):
+        db.align("second", map="own")
