@@ -10,9 +10,10 @@ import numpy.typing as npt
 from semdb.errors import FrameError, UsageError
 from semdb.exchange.source import ExportOptions, MapSource, decoded, new_file
 from semdb.geometry import back_project, transform_points
-from semdb.types import Camera, Float32Array, FloatArray, ImageArray
+from semdb.types import BoolArray, Camera, Float32Array, FloatArray, ImageArray
 
 VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
+LATE = 50_000  # numbers at least before they are sorted in among all
 COUNT_DIGITS = 12  # of the number of points, which is known at the end only
 
 
@@ -23,7 +24,7 @@ def write_ply(source: MapSource, out: Path, options: ExportOptions) -> str:
     """
     if options.voxel_m <= 0:
         raise UsageError(f"--voxel must be positive, but is {options.voxel_m:g}")
-    seen = np.empty(0, np.uint64)
+    seen = _Seen()
     count = without = 0
     with new_file(out).open("wb") as file:
         file.write(_header(0, source.name))
@@ -38,9 +39,7 @@ def write_ply(source: MapSource, out: Path, options: ExportOptions) -> str:
                 points, colours = cloud(image, depth, head.camera, head.world_from_camera, options)
                 keys = voxels(points, options.voxel_m)
                 keys, first = np.unique(keys, return_index=True)
-                new = ~np.isin(keys, seen, assume_unique=True)
-                chosen = np.sort(first[new])
-                seen = np.union1d(seen, keys[new])
+                chosen = np.sort(first[seen.add(keys)])
                 rows = np.empty(len(chosen), VERTEX)
                 for axis, name in enumerate("xyz"):
                     rows[name] = points[chosen, axis]
@@ -56,6 +55,29 @@ def write_ply(source: MapSource, out: Path, options: ExportOptions) -> str:
         raise UsageError(f"no keyframe of the map {source.name!r} has depth: there are no points to export")
     note = f", {without} keyframes without depth" if without else ""
     return f"{count} points, one in {options.voxel_m * 100:g} cm{note}"
+
+
+class _Seen:
+    """Numbers that were there before. The latest are kept apart, so that few are sorted anew for each keyframe."""
+
+    def __init__(self) -> None:
+        self._old, self._late = np.empty(0, np.uint64), np.empty(0, np.uint64)
+
+    def add(self, keys: npt.NDArray[np.uint64]) -> BoolArray:
+        """Which of ascending, different `keys` ``[n]`` were not there; now they are."""
+        new = ~(_among(keys, self._old) | _among(keys, self._late))
+        self._late = np.union1d(self._late, keys[new])
+        if len(self._late) > max(LATE, len(self._old) // 4):
+            self._old, self._late = np.union1d(self._old, self._late), self._late[:0]
+        return new
+
+
+def _among(keys: npt.NDArray[np.uint64], known: npt.NDArray[np.uint64]) -> BoolArray:
+    """Which of `keys` are in the ascending `known`."""
+    if not len(known):
+        return np.zeros(len(keys), np.bool_)
+    place = np.minimum(np.searchsorted(known, keys), len(known) - 1)
+    return np.asarray(known[place] == keys)
 
 
 def cloud(

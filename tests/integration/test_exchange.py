@@ -15,6 +15,7 @@ from semdb.database import schema, tables
 from semdb.database.engine import make_engine
 from semdb.database.store import Store, open_store
 from semdb.errors import RecordingError, SchemaError, UsageError
+from semdb.exchange import ply
 from semdb.exchange.formats import FORMATS, export_map
 from semdb.exchange.ply import voxels
 from semdb.exchange.source import ExportOptions, folder_names
@@ -191,6 +192,15 @@ def rows_of_rrd(path: Path) -> dict[str, dict[int, object]]:
                     if "time" in batch:
                         found.setdefault(f"{part.entity_path}:time", {})[number] = batch["time"][row]
     return found
+
+
+def test_numbers_that_were_there_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ply, "LATE", 40)
+    rng, seen, known = np.random.default_rng(0), ply._Seen(), set[int]()
+    for _ in range(60):
+        keys = np.unique(rng.integers(0, 2000, 100).astype(np.uint64))
+        assert seen.add(keys).tolist() == [key not in known for key in keys.tolist()]
+        known |= set(keys.tolist())
 
 
 def test_rrd_is_read_back_by_rerun(map_url: str, tmp_path: Path) -> None:
