@@ -11,6 +11,7 @@ from typing import Any, Self, TextIO
 from semdb.shown import for_terminal, measure
 
 SECONDS_BETWEEN_LINES = 5.0
+LEAST_FOR_TIME_LEFT = 3  # so many after the first one; they may be steps of minutes, so not more
 
 
 def format_duration(seconds: float) -> str:
@@ -31,6 +32,7 @@ class Progress:
         self.terminal = self.stream.isatty() if terminal is None else terminal
         self.started = self.printed = time.monotonic()
         self._before: int | None = None  # what was done before, by a run or a download that goes on
+        self._first: tuple[int, float] | None = None  # what the first call said was done, and when
         self._bar: Any = None
         self._task: Any = None
 
@@ -58,14 +60,22 @@ class Progress:
     def update(self, done: int, total: int) -> None:
         """Say that `done` of `total` are finished. Cheap: may be called for every frame."""
         now = time.monotonic()
+        if self._first is None:
+            self._first = (done, now)
         rate = (done - (self._before or 0)) / max(now - self.started, 1e-9)
         if self._bar is not None:
             self._bar.update(self._task, completed=done, total=total, rate=f"{measure(rate, 1)} {self.unit}/s")
         elif now - self.printed >= SECONDS_BETWEEN_LINES:
             self.printed = now
-            left = format_duration((total - done) / rate) if rate else "?"
-            line = f"{self.label}: {done} of {total} {self.unit}, {measure(rate, 1)}/s, {left} left"
+            line = f"{self.label}: {done} of {total} {self.unit}, {measure(rate, 1)}/s{self._left(done, total, now)}"
             print(line, file=self.stream, flush=True)
+
+    def _left(self, done: int, total: int, now: float) -> str:
+        """The time left; nothing yet after the first one, which waits for networks and kernels."""
+        first, at = self._first or (done, now)
+        if done < total and done - first < LEAST_FOR_TIME_LEFT:
+            return ""
+        return f", {format_duration((total - done) * (now - at) / max(done - first, 1))} left"
 
 
 def _rich_bar(stream: TextIO) -> Any:

@@ -46,6 +46,8 @@ LAYOUTS: tuple[Layout, ...] = (
     colmap_model.LAYOUT,
 )
 CHILDREN_LOOKED_AT = 200
+PARENTS_LOOKED_AT = 3
+IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 EVERYWHERE = frozenset({"up"})
 
 
@@ -88,7 +90,16 @@ def set_upright(recording: Recording) -> None:
 def not_a_recording(path: Path) -> RecordingError:
     """The error for what no reader knows, with what may have been meant."""
     known = f"known are: {'; '.join(layout.about for layout in LAYOUTS)}"
+    around = next(
+        (parent for parent in path.absolute().parents[:PARENTS_LOOKED_AT] if _looks_like_recording(parent)), None
+    )
+    if around is not None:
+        return RecordingError(f"{path}: is no recording itself, but lies in one: {around}")
     if path.is_file():
+        if path.suffix.lower() in IMAGES:
+            return RecordingError(
+                f"{path}: is an image and no recording; `semdb localize` and `semdb show` take images"
+            )
         return RecordingError(f"{path}: is a file that no reader knows; {known}")
     children = sorted(path.iterdir())
     if not children:

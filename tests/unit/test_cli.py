@@ -236,6 +236,22 @@ def test_plain_progress_is_a_line_every_few_seconds(monkeypatch: pytest.MonkeyPa
     ]
 
 
+def test_the_time_left_does_not_go_by_the_first_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 0.0
+    monkeypatch.setattr("semdb.cli.progress.time.monotonic", lambda: now)
+    stream = io.StringIO()
+    with Progress("decoding", stream=stream) as progress:
+        now = 20.0  # compiling
+        for done in range(1, 22):
+            progress.update(done, 250)
+            now += 0.5
+    assert stream.getvalue().splitlines() == [
+        "decoding: 1 of 250 frames, 0.1/s",
+        "decoding: 11 of 250 frames, 0.4/s, 2:00 left",
+        "decoding: 21 of 250 frames, 0.7/s, 1:54 left",
+    ]
+
+
 def test_progress_of_work_that_goes_on_counts_what_is_new(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 100.0
     monkeypatch.setattr("semdb.cli.progress.time.monotonic", lambda: now)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +40,16 @@ def test_no_such_path_a_file_an_empty_folder_and_other_stuff(tmp_path: Path) -> 
         open_recording(tmp_path / "empty")
     with pytest.raises(RecordingError, match="is no recording that semdb knows; known are: ICL-NUIM"):
         open_recordings(tmp_path)
+
+
+def test_what_lies_in_a_recording_names_it_and_an_image_names_the_commands_for_it(tmp_path: Path) -> None:
+    walk = write_tum(tmp_path / "walk", n=1)
+    for inside in (walk / "rgb", next((walk / "rgb").iterdir())):
+        with pytest.raises(RecordingError, match=f"is no recording itself, but lies in one: {re.escape(str(walk))}$"):
+            open_recording(inside)
+    (tmp_path / "photo.JPG").write_bytes(b"")
+    with pytest.raises(RecordingError, match="is an image and no recording; `semdb localize` and `semdb show` take"):
+        open_recording(tmp_path / "photo.JPG")
 
 
 def test_a_folder_of_recordings_names_them(tmp_path: Path) -> None:
