@@ -25,7 +25,7 @@ from bench.landmarks.rooms import (
     seen_keyframes,
     true_things,
 )
-from bench.landmarks.scores import HEADER, Score, score, summed
+from bench.landmarks.scores import HEADER, Score, relation_counts, score, summed
 from semdb.landmarks.build import find_landmarks
 
 SETTINGS = {"exact": EXACT, "mistakes": SPOILED, "exact, noisy depth": NOISY, "mistakes, noisy depth": SPOILED_NOISY}
@@ -40,6 +40,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     scores: dict[str, list[Score]] = {name: [] for name in SETTINGS}
+    related: dict[str, dict[str, tuple[int, int, int]]] = {name: {} for name in SETTINGS}
     seconds = 0.0
     for seed in range(given.first, given.first + given.rooms):
         room = render_room(seed, given.keyframes, given.width)
@@ -50,11 +51,18 @@ def main() -> None:
             found = find_landmarks(keyframes, len(numbers))
             seconds += time.perf_counter() - start
             scores[name].append(score(found.landmarks, labels, things, list(numbers)))
+            for kind, counts in relation_counts(found.landmarks, labels, things, list(numbers)).items():
+                before = related[name].get(kind, (0, 0, 0))
+                related[name][kind] = (before[0] + counts[0], before[1] + counts[1], before[2] + counts[2])
         print(f"room {seed}: {scores['exact'][-1].things} things", flush=True)
     print(f"{given.rooms} rooms of {given.keyframes} keyframes, {seconds / given.rooms / len(SETTINGS):.2f} s each")
     print(f"{'':24}{HEADER}")
     for name, of_rooms in scores.items():
         print(f"{name:24}{summed(of_rooms).line}")
+    print(f"{'':24}relations, precision and recall by kind")
+    for name, by_kind in related.items():
+        parts = [f"{kind} {r / max(r + w, 1):.3f} {r / max(r + m, 1):.3f} ({r})" for kind, (r, w, m) in by_kind.items()]
+        print(f"{name:24}{', '.join(parts)}")
     if given.json is not None:
         values = {name: [asdict(one) for one in of_rooms] for name, of_rooms in scores.items()}
         given.json.write_text(json.dumps(values, indent=2) + "\n")

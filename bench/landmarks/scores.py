@@ -10,6 +10,7 @@ from scipy.optimize import linear_sum_assignment
 
 from bench.landmarks.rooms import LEAST_SIDE, TrueThing
 from semdb.landmarks.boxes import intersection_over_union
+from semdb.landmarks.relations import find_relations
 from semdb.landmarks.values import Landmark, LandmarkState
 
 SEEN = 3  # keyframes in which the detector found a thing: from here on it has to be there
@@ -115,6 +116,48 @@ def _pairs(landmarks: Sequence[Landmark], labels: Sequence[Sequence[int]]) -> tu
         right += same
         joined += len(thing.members) * (len(thing.members) - 1) // 2 - same
     return right, joined, sum(n * (n - 1) // 2 for n in total.values()) - right
+
+
+def relation_counts(
+    landmarks: Sequence[Landmark],
+    labels: Sequence[Sequence[int]],
+    things: Mapping[int, TrueThing],
+    names: Sequence[str],
+    kinds: Sequence[str] = ("on", "in", "under", "above", "next_to", "near"),
+) -> dict[str, tuple[int, int, int]]:
+    """Relations of the landmarks against those of the true boxes: right, wrong, missed, by kind.
+
+    Between confirmed landmarks, one of each thing, with scores of at least one half; where the true boxes give 0.3 to
+    0.7 it may be either.
+    """
+    there = {_main(thing, labels): thing for thing in landmarks if thing.state is LandmarkState.CONFIRMED}
+    keys = sorted(key for key in there if key in things)
+    up = np.array([0.0, 0.0, 1.0])
+    true = [_as_landmark(things[key], names) for key in keys]
+
+    def scores_of(of: Sequence[Landmark]) -> dict[tuple[int, str, int], float]:
+        return {(r.one, str(r.kind), r.other): r.score for r in find_relations(of, names, up, 0.05)}
+
+    found, wanted = (
+        scores_of([replace(there[key], category=t.category) for key, t in zip(keys, true, strict=True)]),
+        scores_of(true),
+    )
+    counts = {}
+    for kind in kinds:
+        mine = {key: value for key, value in found.items() if key[1] == kind}
+        theirs = {key: value for key, value in wanted.items() if key[1] == kind}
+        right = sum(value >= 0.5 and mine.get(key, 0) >= 0.5 for key, value in theirs.items())
+        missed = sum(value > 0.7 and mine.get(key, 0) < 0.5 for key, value in theirs.items())
+        wrong = sum(value >= 0.5 and theirs.get(key, 0) < 0.3 for key, value in mine.items())
+        counts[kind] = (right, wrong, missed)
+    return counts
+
+
+def _as_landmark(thing: TrueThing, names: Sequence[str]) -> Landmark:
+    """A true thing as if it were a landmark that is known to a millimetre."""
+    category = list(names).index(thing.category)
+    evidence, sure = np.zeros(len(names)), np.eye(3) * 1e-6
+    return Landmark((), category, 1.0, evidence, thing.box, sure, 3, 0, 0, 0, 0, LandmarkState.CONFIRMED, ())
 
 
 def summed(scores: Sequence[Score]) -> Score:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from semdb.api.answers import StoredContent, keyframe_of
@@ -14,8 +15,13 @@ from semdb.errors import NotFoundError, UsageError
 from semdb.names import storable
 
 if TYPE_CHECKING:
+    from datetime import datetime
+
+    from semdb.database.landmark_reading import StoredLandmark
     from semdb.database.reporting import WorkerStatus
+    from semdb.door.found import Found
     from semdb.door.links import KeyframeLink
+    from semdb.localization.query_image import PathText
     from semdb.types import ModelInfo
 
 
@@ -99,6 +105,53 @@ class Reading(Base):
         from semdb.api.links import links_of
 
         return links_of(self._store(), self._map_id(map), odometry=odometry)
+
+    def find(
+        self,
+        what: str,
+        *,
+        near: str | None = None,
+        on: str | None = None,
+        not_near: str | None = None,
+        map: str | None = None,
+        seen_after: str | int | datetime | None = None,
+        origin: Sequence[float] | None = None,
+        limit: int = 10,
+    ) -> Found:
+        """Landmarks of a class, or of what a word means, the best first: where they are and from where they are seen.
+
+        They may have to stand `near` or `on` something, or `not_near` it, and to have been seen after a time (also in
+        nanoseconds), or in the recording of that name. The nearer to `origin` (X, Y, Z) the better. Where there is no
+        hit, `missing` says why. Raises UsageError for words that mean nothing, NotFoundError.
+        """
+        from semdb.api.finding import find
+
+        return find(
+            *(self._store(), what),
+            near=near,
+            on=on,
+            not_near=not_near,
+            map=map,
+            seen_after=seen_after,
+            origin=origin,
+            limit=limit,
+        )
+
+    def landmarks(self, map: str) -> list[StoredLandmark]:
+        """The landmarks of a map by id. Raises NotFoundError, CodecError for a damaged row."""
+        from semdb.database.landmark_reading import load_landmarks
+
+        store = self._store()
+        return load_landmarks(store.engine, store.find_map(map).id)[0]
+
+    def plot_found(self, found: Found, folder: PathText) -> list[Path]:
+        """Draws the maps of the hits from above, the hits in red, as ``MAP-landmarks.png``. Returns the files.
+
+        Raises UsageError for a folder that cannot be written.
+        """
+        from semdb.api.plotting import plot_found
+
+        return plot_found(self._store(), found, Path(folder))
 
     def sql(self, statement: str) -> Rows:
         """The rows of one read-only statement, fetched while they are iterated over.

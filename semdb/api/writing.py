@@ -328,17 +328,19 @@ class Writing(Reading):
         *,
         voxel_m: float = 0.02,
         max_depth_m: float = 8.0,
+        landmarks: bool = False,
         progress: Progress | None = None,
     ) -> str:
         """Writes a map as other programs read it, or whole (`semdb`); returns a line about what was written.
 
-        `format` is tum, colmap, kapture, ply, mcap, g2o or semdb; `out` a file or folder that is not there. `voxel_m`
-        and `max_depth_m` thin and bound a cloud. Raises UsageError, NotFoundError, DatabaseError.
+        `format` is tum, colmap, kapture, landmarks, ply, mcap, g2o or semdb; `out` a file or folder that is not there.
+        `voxel_m` and `max_depth_m` thin and bound a cloud; with `landmarks` it has their boxes. Raises UsageError,
+        NotFoundError, DatabaseError.
         """
         from semdb.exchange.formats import export_map
         from semdb.exchange.source import ExportOptions
 
-        options = ExportOptions(voxel_m=voxel_m, max_depth_m=max_depth_m)
+        options = ExportOptions(voxel_m=voxel_m, max_depth_m=max_depth_m, landmarks=landmarks)
         return export_map(self._store(), format, map, Path(out), options, progress)
 
     def import_map(self, folder: PathText, *, map: str | None = None, progress: Progress | None = None) -> Copied:

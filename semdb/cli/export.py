@@ -13,11 +13,14 @@ from semdb.cli.options import JsonFlag, Overrides, open_database, settings_optio
 @settings_options(models=False)
 def command(
     overrides: Overrides,
-    form: Annotated[str, typer.Argument(metavar="FORMAT", help="tum, colmap, kapture, ply, mcap, rrd, g2o or semdb.")],
+    form: Annotated[
+        str, typer.Argument(metavar="FORMAT", help="tum, colmap, kapture, ply, mcap, rrd, g2o, landmarks or semdb.")
+    ],
     map_name: Annotated[str, typer.Argument(metavar="MAP", help="Name of the map.")],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="File or folder to write, which must not be there.")],
     voxel: Annotated[float, typer.Option("--voxel", metavar="M", help="ply: one point in so large a cube.")] = 0.02,
     max_depth: Annotated[float, typer.Option("--max-depth", metavar="M", help="ply: none farther than this.")] = 8.0,
+    landmarks: Annotated[bool, typer.Option("--landmarks", help="ply: with the boxes of landmarks.")] = False,
     json: JsonFlag = False,
 ) -> None:
     """Write a map in a format that other programs read, or whole, for another semdb."""
@@ -25,7 +28,13 @@ def command(
     from semdb.cli.progress import StagedProgress
 
     with open_database(overrides.settings()) as database, StagedProgress() as progress:
-        about = database.export(form, map_name, out, voxel_m=voxel, max_depth_m=max_depth, progress=progress.update)
+        about = database.export(
+            *(form, map_name, out),
+            voxel_m=voxel,
+            max_depth_m=max_depth,
+            landmarks=landmarks,
+            progress=progress.update,
+        )
     if json:
         print_json({"map": map_name, "format": form, "path": str(out), "written": about})
     else:

@@ -34,6 +34,7 @@ COMMANDS: dict[str, str] = {
     "delete": "semdb.cli.delete",
     "refine": "semdb.cli.refine",
     "align": "semdb.cli.align",
+    "find": "semdb.cli.find",
     "loops": "semdb.cli.loops",
     "localize": "semdb.cli.localize",
     "evaluate": "semdb.cli.evaluate",

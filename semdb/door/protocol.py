@@ -6,7 +6,10 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Protocol, Self, TypeAlias, overload
 
 if TYPE_CHECKING:
+    from datetime import datetime
+
     from semdb.database.records import Deleted, MapInfo, RecordingStatus
+    from semdb.door.found import Found
     from semdb.door.values import Answer, Keyframe, Rows
     from semdb.ingestion.run import IngestSummary
     from semdb.localization.query_image import Depth, Image, PathText
@@ -56,6 +59,19 @@ class SemanticDatabase(Protocol):
         after: int = 0,
         limit: int | None = None,
     ) -> list[Keyframe]: ...
+
+    def find(
+        self,
+        what: str,
+        *,
+        near: str | None = None,
+        on: str | None = None,
+        not_near: str | None = None,
+        map: str | None = None,
+        seen_after: str | int | datetime | None = None,
+        origin: Sequence[float] | None = None,
+        limit: int = 10,
+    ) -> Found: ...
 
     def sql(self, statement: str) -> Rows: ...
 

@@ -29,6 +29,7 @@ FORMATS = {
     "ply": Format("semdb.exchange.ply:write_ply", "coloured cloud of the keyframes' depth (a file)"),
     "mcap": Format("semdb.exchange.mcap:write_mcap", "images, cameras and poses for Foxglove and ROS 2 (a file)"),
     "rrd": Format("semdb.exchange.rrd:write_rrd", "cameras, images and depth for rerun (a file)"),
+    "landmarks": Format("semdb.exchange.landmarks:write_landmarks", "things and boxes: .csv, .json, .geojson (a file)"),
     "g2o": Format("semdb.exchange.g2o:write_g2o", "keyframes and the links between them as a pose graph (a file)"),
     "semdb": Format("semdb.exchange.whole:write_whole", "the whole map, for `semdb import` (a folder)"),
 }

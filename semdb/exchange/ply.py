@@ -14,6 +14,9 @@ from semdb.types import BoolArray, Camera, Float32Array, FloatArray, ImageArray
 
 VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
 LATE = 50_000  # numbers at least before they are sorted in among all
+EDGES = np.array(
+    [[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]], np.int64
+)  # of a box, by its corners
 COUNT_DIGITS = 12  # of the number of points, which is known at the end only
 
 
@@ -27,7 +30,8 @@ def write_ply(source: MapSource, out: Path, options: ExportOptions) -> str:
     seen = _Seen()
     count = without = 0
     with new_file(out).open("wb") as file:
-        file.write(_header(0, source.name))
+        boxes = _boxes(source) if options.landmarks else []
+        file.write(_header(0, source.name, len(boxes)))
         for done, head in enumerate(source.heads, 1):
             try:
                 image, depth = decoded(source.image(head.id), head)
@@ -48,13 +52,46 @@ def write_ply(source: MapSource, out: Path, options: ExportOptions) -> str:
                 file.write(rows.tobytes())
                 count += len(chosen)
             source.tell("exporting", done)
+        file.write(b"".join(corners.tobytes() for corners in boxes))
+        file.write(b"".join((EDGES + count + 8 * k).astype("<i4").tobytes() for k in range(len(boxes))))
         file.seek(0)
-        file.write(_header(count, source.name))
+        file.write(_header(count + 8 * len(boxes), source.name, len(boxes)))
     if not count:
         out.unlink()
         raise UsageError(f"no keyframe of the map {source.name!r} has depth: there are no points to export")
     note = f", {without} keyframes without depth" if without else ""
-    return f"{count} points, one in {options.voxel_m * 100:g} cm{note}"
+    drawn = f", {len(boxes)} boxes of landmarks" if options.landmarks else ""
+    return f"{count} points, one in {options.voxel_m * 100:g} cm{drawn}{note}"
+
+
+def _boxes(source: MapSource) -> list[npt.NDArray[np.void]]:
+    """The corners of the boxes of landmarks that are not gone, eight rows of `VERTEX` each, in their classes' colours.
+
+    Raises UsageError where the map has none.
+    """
+    import hashlib
+
+    from semdb.database.landmark_reading import load_landmarks
+    from semdb.database.landmark_rows import load_gravity
+    from semdb.exchange.landmarks import box_of
+
+    things, _ = load_landmarks(source.store.engine, source.map_id, source.store.say)
+    gravity = load_gravity(source.store.engine, source.map_id)
+    up = np.array((0.0, 0.0, 1.0) if gravity is None else gravity.up)
+    found = []
+    for thing in things:
+        if thing.state == "gone":
+            continue
+        rows = np.empty(8, VERTEX)
+        for axis, column in zip("xyz", box_of(thing, up).corners.T, strict=True):
+            rows[axis] = column
+        colour = hashlib.sha256(thing.category.encode("utf-8", "surrogatepass")).digest()
+        for channel, name in enumerate(("red", "green", "blue")):
+            rows[name] = 64 + colour[channel] // 2
+        found.append(rows)
+    if not found:
+        raise UsageError(f"the map {source.name!r} has no landmarks: run semdb refine first")
+    return found
 
 
 class _Seen:
@@ -102,7 +139,7 @@ def voxels(points: FloatArray, size: float) -> npt.NDArray[np.uint64]:
     return np.asarray((cells[:, 0] << np.uint64(42)) | (cells[:, 1] << np.uint64(21)) | cells[:, 2])
 
 
-def _header(count: int, name: str) -> bytes:
+def _header(count: int, name: str, boxes: int = 0) -> bytes:
     lines = [
         "ply",
         "format binary_little_endian 1.0",
@@ -110,6 +147,7 @@ def _header(count: int, name: str) -> bytes:
         f"element vertex {count:0{COUNT_DIGITS}d}",
         *(f"property float {axis}" for axis in "xyz"),
         *(f"property uchar {channel}" for channel in ("red", "green", "blue")),
+        *((f"element edge {12 * boxes}", "property int vertex1", "property int vertex2") if boxes else ()),
         "end_header\n",
     ]
     return "\n".join(lines).encode()

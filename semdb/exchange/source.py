@@ -115,11 +115,15 @@ def new_file(path: Path) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class ExportOptions:
-    """`voxel_m` thins clouds, `stride` samples depth pixels, `max_depth_m` leaves out what is farther."""
+    """`voxel_m` thins clouds, `stride` samples depth pixels, `max_depth_m` leaves out what is farther.
+
+    `landmarks` draws the boxes of landmarks into clouds.
+    """
 
     voxel_m: float = 0.02
     stride: int = 4
     max_depth_m: float = 8.0
+    landmarks: bool = False
 
 
 class Exporter(Protocol):

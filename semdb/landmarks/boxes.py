@@ -38,6 +38,13 @@ def upright_axes(up: FloatArray) -> FloatArray:
     return np.stack([first, np.cross(up, first), up], axis=1)
 
 
+def turned_box(centre: FloatArray, size: FloatArray, yaw: float, up: FloatArray) -> Box:
+    """The upright box with that `yaw` (radians) about `up`, from the first of `upright_axes`: as it is stored."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return Box(np.asarray(centre, np.float64), np.asarray(size, np.float64), upright_axes(up) @ turn)
+
+
 def upright_box(points: FloatArray, up: FloatArray, trim: float = 0.0, least: float = 0.005) -> Box:
     """The box of the least footprint about `points` ``[n, 3]``, without the share `trim` at each end of each axis.
 
@@ -68,14 +75,18 @@ def upright_box(points: FloatArray, up: FloatArray, trim: float = 0.0, least: fl
 
 def intersection_over_union(one: Box, other: Box) -> float:
     """Of two upright boxes with the same up: shared volume over joint volume."""
+    shared = shared_volume(one, other)
+    return float(shared / (np.prod(one.size) + np.prod(other.size) - shared))
+
+
+def shared_volume(one: Box, other: Box) -> float:
+    """Of two upright boxes with the same up, cubic metres."""
     up = one.axes[:, 2]
     a, b = one.centre @ up, other.centre @ up
     height = min(a + one.size[2] / 2, b + other.size[2] / 2) - max(a - one.size[2] / 2, b - other.size[2] / 2)
     if height <= 0:
         return 0.0
-    area = shared_area(footprint(one, one.axes), footprint(other, one.axes))
-    shared = height * area
-    return float(shared / (np.prod(one.size) + np.prod(other.size) - shared))
+    return float(height * shared_area(footprint(one, one.axes), footprint(other, one.axes)))
 
 
 def footprint(box: Box, axes: FloatArray) -> FloatArray:

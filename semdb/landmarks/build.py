@@ -6,12 +6,13 @@ order, so the result does not depend on when, or by whom, they were stored.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from semdb.landmarks.boxes import upright_box
+from semdb.landmarks.boxes import shared_volume, upright_box
 from semdb.landmarks.clustering import UNIT, clusters
 from semdb.landmarks.evidence import fuse, name_probabilities
 from semdb.landmarks.gravity import Gravity, estimate_gravity
@@ -66,7 +67,7 @@ def find_landmarks(
     names = name_probabilities(classes, confusion)
     cluster = associate(keyframes, lifted, sightings, views, names, options)
     found = _Assembly(keyframes, lifted, sightings, views, cluster, names, gravity, options)
-    landmarks = [found.landmark(root) for root in np.unique(cluster).tolist()]
+    landmarks = found.all()
     objects = sum(len(frame.category) for frame in keyframes)
     placed = sum(len(thing.members) for thing in landmarks)
     return Landmarks(
@@ -144,7 +145,49 @@ class _Assembly:
         np.add.at(own, pair[same], views.overlap[labelled][same, 0])
         self._own = own
 
+    def all(self) -> list[Landmark]:
+        """The landmark of each cluster; those that take up one place are made one.
+
+        Of two clusters that no keyframe saw beside each other, under names that are taken for each other, the one
+        whose box lies in the other's most comes first.
+        """
+        things = {root: self.landmark(root) for root in sorted(self._rows)}
+        while pairs := self._at_one_place(things):
+            done: set[int] = set()
+            for _, one, other in pairs:
+                if one in done or other in done:
+                    continue
+                done |= {one, other}
+                self._rows[one] = np.sort(np.concatenate([self._rows[one], self._rows.pop(other)]))
+                del things[other]
+                things[one] = self.landmark(one)
+        return list(things.values())
+
+    def _at_one_place(self, things: Mapping[int, Landmark]) -> list[tuple[int, int, int]]:
+        """Pairs of clusters that are one thing: overlap (negative, thousandths), one, other; the surest first."""
+        roots = sorted(things)
+        if len(roots) < 2:
+            return []
+        centres = np.array([things[root].box.centre for root in roots])
+        reach = np.array([float(np.linalg.norm(things[root].box.size)) for root in roots])
+        found = []
+        mixed = np.maximum(self._names, self._names.T)
+        for a, b in cKDTree(centres).query_pairs(float(reach.max())):
+            one, other = things[roots[min(a, b)]], things[roots[max(a, b)]]
+            if np.linalg.norm(one.box.centre - other.box.centre) > (one.box.size.max() + other.box.size.max()) / 2:
+                continue
+            known = {member.keyframe for member in one.members}
+            if any(member.keyframe in known for member in other.members):
+                continue
+            if one.category != other.category and mixed[one.category, other.category] <= 2 * float(self._names.min()):
+                continue
+            share = shared_volume(one.box, other.box) / float(min(np.prod(one.box.size), np.prod(other.box.size)))
+            if share >= self._options.one_place:
+                found.append((-round(share * 1000), roots[min(a, b)], roots[max(a, b)]))
+        return sorted(found)
+
     def landmark(self, root: int) -> Landmark:
+        """The landmark of the sightings of a cluster."""
         rows, options = self._rows[root], self._options
         members: dict[int, list[int]] = {}
         for row in rows.tolist():

@@ -13,9 +13,11 @@ from semdb.landmarks.register import surface_of
 from semdb.types import FloatArray
 
 UPRIGHT = 0.3  # length of the mean of the cameras' up: less, and they were rolled all ways
+WITHIN = 0.6  # cosine: so far from the cameras' mean up that up may be, 53 degrees
 LEVEL = 0.97  # cosine: a surface that is level, 14 degrees
 FLOOR_SHARE = 0.1  # of the level surface below the cameras that a floor has at least
 _BIN = 0.02
+_CANDIDATES, _TRIED = 300, 4  # directions of surfaces that are looked at, and of the best ones made exact
 _MOST_POINTS = 400  # of a keyframe
 
 
@@ -65,14 +67,24 @@ def _surfaces(lifted: Sequence[LiftedKeyframe], poses: FloatArray) -> tuple[Floa
 def _direction(poses: FloatArray, normals: FloatArray) -> tuple[FloatArray, float]:
     mean = -poses[:, :3, 1].mean(axis=0) if len(poses) else np.array([0.0, 0.0, 1.0])
     length = float(np.linalg.norm(mean))
-    starts = [mean / length] if length > UPRIGHT else [*np.eye(3), *-np.eye(3)]
+    starts = [mean / length] if length > UPRIGHT else []
     if len(normals) < 50:
-        return starts[0], 0.0
+        return starts[0] if starts else np.array([0.0, 0.0, 1.0]), 0.0
+    # cameras that look down on a desk are tilted by more than surfaces can mend: those are asked for directions, too
+    some = normals[:: max(1, len(normals) // _CANDIDATES)]
+    worth = np.array([_agreement(direction, normals) for direction in some])
+    for k in np.argsort(-np.round(worth, 6), kind="stable")[:_TRIED].tolist():
+        starts += [some[k], -some[k]]
+    starts += [*np.eye(3), *-np.eye(3)]
     found = [_refined(start, normals) for start in starts]
+    if length > UPRIGHT:  # a room lies as well on its side, but nobody holds a camera so
+        found = [direction for direction in found if direction @ mean >= WITHIN * length] or found
     shares = [_agreement(direction, normals) for direction in found]
-    # a room looks much the same on its side: of equal ones the one that the cameras' tilt is nearer to
-    worth = [share + 0.2 * float(direction @ mean) for share, direction in zip(shares, found, strict=True)]
-    best = int(np.argmax(np.round(worth, 6)))
+    # a room lies as well on its side: up is where floors and tables look to, and near to the cameras' tilt
+    facing = [float(np.mean(normals @ direction > np.cos(np.radians(5)))) for direction in found]
+    tilt = [float(direction @ mean) / max(length, UPRIGHT) for direction in found]
+    scores = [share + seen + 0.3 * near for share, seen, near in zip(shares, facing, tilt, strict=True)]
+    best = int(np.argmax(np.round(scores, 6)))
     return found[best], shares[best] * (1.0 if length > UPRIGHT else 0.5)
 
 

@@ -89,7 +89,9 @@ def lift_keyframe(
             points.append(np.empty((0, 3), np.float32))
             outline.append(np.empty((0, 3), np.float32))
             continue
-        inner, values = buffers[0][:number], known.ravel()[buffers[0][:number]]
+        inner = buffers[0][:number]
+        inner = inner[at_one_depth(known.ravel()[inner], lift)]
+        number, values = len(inner), known.ravel()[inner]
         points.append(_points(camera, inner, values, lift.samples))
         rest = rim_pixels(known, owner, k + 1, border + 2, inner, number, box, state, buffers[1], buffers[2])
         edge = _points(camera, buffers[1][:rest], buffers[2][:rest], lift.outline // 2, known, owner == k + 1)
@@ -110,6 +112,22 @@ def lift_keyframe(
         grid_owner=np.ascontiguousarray(owner[half::step, half::step]),
         step=step,
     )
+
+
+def at_one_depth(depth: Float32Array, lift: LiftOptions) -> BoolArray:
+    """Which of the pixels of a mask are the thing's, by their depth ``[n]``: bool ``[n]``.
+
+    A mask takes in what is seen through a chair's back, or beside it. Depths with a gap between them are of several
+    things: the one with most pixels stays, and those that are about as large.
+    """
+    order = np.argsort(depth, kind="stable")
+    ranked = depth[order]
+    gaps = np.diff(ranked) > lift.gap_m + lift.gap_share * ranked[:-1]
+    group = np.concatenate([[0], np.cumsum(gaps)])
+    counts = np.bincount(group)
+    kept = np.zeros(len(depth), np.bool_)
+    kept[order] = (counts >= lift.gap_kept * counts.max())[group]
+    return kept
 
 
 def _points(

@@ -13,6 +13,8 @@ class LiftOptions:
     `jump_share` (of the depth): neighbours that differ by more lie on two surfaces. `samples`: points kept of a
     sighting to compare it with others, `outline`: to know its shape. `fewest`: sightings of fewer points have no place.
     `same_mask`: masks of one keyframe with at least this intersection over union are one sighting under two names.
+    Depths of a mask with a gap of `gap_m` + `gap_share` of the depth between them are of several things; those with
+    `gap_kept` as many pixels as the largest stay.
     """
 
     border: int = 2
@@ -24,6 +26,9 @@ class LiftOptions:
     outline: int = 768
     fewest: int = 12
     same_mask: float = 0.5
+    gap_m: float = 0.08
+    gap_share: float = 0.03
+    gap_kept: float = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +101,8 @@ class ShapeOptions:
 @dataclass(frozen=True, slots=True)
 class LandmarkOptions:
     """All options. A landmark is confirmed by so many keyframes, which are at least a share of those that should have
-    seen it; `gone`: later keyframes that see through it.
+    seen it; `gone`: later keyframes that see through it. `one_place`: two that no keyframe saw beside each other are
+    one where so much of the smaller box lies in the other.
     """
 
     lift: LiftOptions = LiftOptions()
@@ -104,6 +110,7 @@ class LandmarkOptions:
     register: RegisterOptions = RegisterOptions()
     link: LinkOptions = LinkOptions()
     shape: ShapeOptions = ShapeOptions()
-    confirmed: int = 2
+    confirmed: int = 3
     confirmed_share: float = 0.2
     gone: int = 2
+    one_place: float = 0.3

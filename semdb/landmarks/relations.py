@@ -138,23 +138,25 @@ def _directed(one: _Standing, other: _Standing, shared: float, sigma: float) -> 
     gap = one.low - other.high
     width = 0.04 + sigma
     touching = float(np.exp(-0.5 * (gap / width) ** 2)) if gap > 0 else float(np.exp(-0.5 * (gap / (2 * width)) ** 2))
-    if gap < 0 and (other.category in SEATS or one.low > other.low + 0.5 * (other.high - other.low)):
-        above_seat = one.low > other.low + 0.2 * (other.high - other.low)
-        sticks_out = one.high > other.high - 0.02 or other.category in SEATS
-        touching = max(touching, 0.9 if above_seat and sticks_out else 0.0)
+    if gap < 0 and one.category not in SEATS | OPEN_BELOW and one.area < 0.7 * other.area:
+        # a seat is lower than its chair; and what else lies on a table makes the box of the table higher
+        lowest = 0.2 if other.category in SEATS else 0.3
+        carries = other.category in SEATS | OPEN_BELOW or one.high > other.high - 0.02
+        above = one.low > other.low + lowest * (other.high - other.low)
+        touching = max(touching, 0.9 if carries and above else 0.0)
     inside_height = min(one.high, other.high) - max(one.low, other.low)
     held = over * _half(-inside_height / height, -0.6, 0.1) * _half(one.area / max(other.area, 1e-9), 1.0, 0.1)
     found = {
         Relation.ON: over * larger * touching,
-        Relation.IN: held if other.category in HOLDS else 0.0,
+        Relation.IN: held if other.category in HOLDS and one.category not in SEATS | OPEN_BELOW | HOLDS else 0.0,
         Relation.ABOVE: either * _half(-gap, -0.1, 0.03 + sigma),
     }
     below = other.low - one.high
     under = either * _half(-below, -0.1, 0.03 + sigma)
     if other.category in OPEN_BELOW and one.category != other.category:
         # its box reaches the floor, and what stands beneath it stands within its box
-        stands = _half(-shared / max(one.area, 1e-9), -0.5, 0.1) * _half(one.high - other.high, -0.05, 0.03 + sigma)
-        under = max(under, stands * _half(one.low - other.low, 0.15, 0.05 + sigma))
+        stands = _half(-share, -0.5, 0.1) * _half(one.high - other.high, -0.05, 0.03 + sigma)
+        under = max(under, stands * _half(one.low - other.low, 0.15, 0.05))
     found[Relation.UNDER] = under
     return found
 

@@ -65,7 +65,7 @@ def test_each_landmark_is_one_thing_and_each_thing_one_landmark(room: Room, foun
     often = [labels for labels, thing in zip(things, found.landmarks, strict=True) if thing.keyframes > 1]
     assert len(often) >= 10
     assert len({label for labels in often for label in labels}) == len(often)
-    assert {thing.state for thing in found.landmarks if thing.keyframes > 1} == {LandmarkState.CONFIRMED}
+    assert {thing.state for thing in found.landmarks if thing.keyframes > 2} == {LandmarkState.CONFIRMED}
 
 
 def test_classes_and_counts_are_those_of_the_sightings(room: Room, found: Landmarks) -> None:

@@ -15,7 +15,7 @@ Environment = Mapping[str, str]
 
 MOST_NAMES = 200
 _PATHS = re.compile(r"\b(PATH|FILE|FOLDER|DIR|IMAGE)\b")  # words of metavars
-EXPORTS = ("tum", "colmap", "kapture", "ply", "mcap", "rrd", "g2o", "semdb")
+EXPORTS = ("tum", "colmap", "kapture", "ply", "mcap", "rrd", "landmarks", "g2o", "semdb")
 METHODS = ("semdb", "cnn", "paper", "chen", "sift-reference", "oracle", "colmap")
 FIXED: Mapping[str, Entries] = {
     "--features": (("surf", "SURF, 64 dimensions"), ("sift", "SIFT"), ("orb", "ORB, binary")),

@@ -1,0 +1,243 @@
+"""Things by what they are and where they stand."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+from semdb.database import checked
+from semdb.database.keyframe_rows import pose_of
+from semdb.door.found import Evidence, Found, FoundLandmark, Missing, Viewpoint
+from semdb.errors import CodecError, UsageError
+from semdb.shown import for_terminal
+from semdb.types import FloatArray
+
+if TYPE_CHECKING:
+    from semdb.database.landmark_search import Wanted
+    from semdb.database.store import Store
+    from semdb.landmarks.words import Understood
+
+MOST_HITS = 1000
+NEVER_SEEN, GONE, NOT_LOOKED_AT = "never_seen", "gone", "not_looked_at"
+
+
+def find(
+    store: Store,
+    what: str,
+    *,
+    near: str | None = None,
+    on: str | None = None,
+    not_near: str | None = None,
+    map: str | None = None,
+    seen_after: str | int | datetime | None = None,
+    origin: Sequence[float] | None = None,
+    limit: int = 10,
+) -> Found:
+    """Landmarks that are what was asked for: see `semdb.api.reading.Reading.find`."""
+    from semdb.database import landmark_search as rows
+    from semdb.landmarks.words import understand
+
+    if not 1 <= limit <= MOST_HITS:
+        raise UsageError(f"limit is between 1 and {MOST_HITS}, not {limit}")
+    known = rows.known_classes(store.engine)
+    asked = {"what": what, "near": near, "on": on, "not_near": not_near}
+    meant = {name: understand(word, known) for name, word in asked.items() if word is not None}
+    info = None if map is None else store.find_map(map)
+    after_ns, seen_in = _seen_after(store, seen_after, None if info is None else info.id)
+    wanted = rows.Wanted(
+        classes=meant["what"].classes,
+        near=_classes(meant, "near"),
+        on=_classes(meant, "on"),
+        not_near=_classes(meant, "not_near"),
+        map_id=None if info is None else info.id,
+        seen_after_ns=after_ns,
+        seen_in=seen_in,
+        origin=None if origin is None else _origin(origin),
+        limit=limit,
+    )
+    found = rows.search(store.engine, wanted)
+    evidence = rows.sightings_of(store.engine, [row.landmark_id for row in found]) if found else {}
+    hits = tuple(_hit(row, evidence.get(int(row.landmark_id), []), wanted) for row in found)
+    understood: dict[str, Mapping[str, Any]] = {
+        name: {"said": item.said, "classes": list(item.classes), "how": item.how} for name, item in meant.items()
+    }
+    missing = None if hits else _missing(store, wanted, meant)
+    return Found(understood, hits, missing, rows.as_text(store.engine, wanted))
+
+
+def _classes(meant: Mapping[str, Understood], name: str) -> tuple[str, ...]:
+    return meant[name].classes if name in meant else ()
+
+
+def _origin(given: Sequence[float]) -> tuple[float, float, float]:
+    if len(given) != 3 or not all(math.isfinite(value) and abs(value) < 1e7 for value in given):
+        raise UsageError(f"a place is three numbers in metres, X,Y,Z, not {given}")
+    x, y, z = (float(value) for value in given)
+    return x, y, z
+
+
+def _seen_after(store: Store, given: str | int | datetime | None, map_id: int | None) -> tuple[int | None, str | None]:
+    """A time in nanoseconds, or the name of a recording. Raises UsageError for what is neither."""
+    if given is None or isinstance(given, int):
+        return given, None
+    if isinstance(given, datetime):
+        return _nanoseconds(given), None
+    if re.fullmatch(r"\d{1,19}", given) and len(given) >= 16:
+        return int(given), None
+    names = {item.name for item in store.status(map_id)}
+    if given in names:
+        return None, given
+    try:
+        return _nanoseconds(datetime.fromisoformat(given)), None
+    except ValueError:
+        listed = ", ".join(sorted(names)[:5]) or "none"
+        raise UsageError(
+            f"--seen-after {given!r} is neither a time (2026-05-31T14:00, UTC unless it says so, or nanoseconds) nor a "
+            f"recording; recordings: {listed}"
+        ) from None
+
+
+def _nanoseconds(moment: datetime) -> int:
+    aware = moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
+    return round(aware.timestamp() * 1e6) * 1000
+
+
+def _hit(row: Any, sightings: Sequence[Any], wanted: Wanted) -> FoundLandmark:
+    where = f"of landmark {row.landmark_id}"
+
+    def real(name: str, low: float = -1e12, high: float = 1e12) -> float:
+        return checked.real(getattr(row, name), f"landmarks.{name} {where}", low, high)
+
+    parts = {"class": real("class_score")}
+    if wanted.near:
+        parts["near"] = real("near_score")
+    if wanted.on:
+        parts["on"] = real("on_score")
+    parts["state"] = real("state_score")
+    if wanted.origin is not None:
+        parts["distance"] = real("distance_score")
+    return FoundLandmark(
+        landmark_id=int(row.landmark_id),
+        map=row.map,
+        category=row.category,
+        probability=real("probability"),
+        position=(real("x"), real("y"), real("z")),
+        covariance=_covariance([real(f"cov_{axes}") for axes in ("xx", "xy", "xz", "yy", "yz", "zz")]),
+        size=(real("size_x"), real("size_y"), real("size_z")),
+        yaw=real("yaw"),
+        state=row.state,
+        sightings=int(row.sightings),
+        keyframes=int(row.keyframes),
+        last_recording=row.last_recording,
+        last_frame_index=row.last_frame_index,
+        last_keyframe_id=row.last_keyframe_id,
+        last_seen_ns=row.last_seen_ns,
+        score=real("score"),
+        parts=parts,
+        distance=None if wanted.origin is None else math.sqrt(real("distance_squared", 0.0)),
+        evidence=tuple(
+            Evidence(
+                *(int(s.object_id), int(s.keyframe_id), s.recording, int(s.frame_index)),
+                *(s.name, float(s.score), float(s.coverage), float(s.visibility)),
+            )
+            for s in sightings
+        ),
+        viewpoint=_viewpoint(row),
+    )
+
+
+def _covariance(values: Sequence[float]) -> FloatArray:
+    import numpy as np
+
+    xx, xy, xz, yy, yz, zz = values
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], np.float64)
+
+
+def _viewpoint(row: Any) -> Viewpoint | None:
+    """None where the keyframe was deleted, or its pose is none."""
+    if row.view_keyframe_id is None:
+        return None
+    names = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
+    try:
+        pose = pose_of([getattr(row, f"view_{name}") for name in names], f"keyframe {row.view_keyframe_id}")
+    except CodecError:
+        return None
+    return Viewpoint(
+        int(row.view_keyframe_id),
+        row.view_recording,
+        int(row.view_frame_index),
+        pose,
+        (float(row.view_x1), float(row.view_y1), float(row.view_x2), float(row.view_y2)),
+        float(row.view_distance),
+    )
+
+
+def _missing(store: Store, wanted: Wanted, meant: Mapping[str, Understood]) -> Missing:
+    """Which of three it is that nothing was found."""
+    from semdb.database import landmark_search as rows
+
+    said = meant["what"].said
+    usual = tuple(
+        {"relation": kind, "category": name, "count": number}
+        for kind, name, number in rows.usual_places(store.engine, wanted.classes)
+    )
+    there = rows.earlier_ones(store.engine, wanted)
+    for part, names in (("near", wanted.near), ("on", wanted.on)):
+        if names and not rows.anchors(store.engine, names, wanted.map_id):
+            text = f"no {meant[part].said} was seen, so no place {part} one was looked at"
+            return Missing(NOT_LOOKED_AT, text, _candidates(there), usual)
+    gone = rows.gone_ones(store.engine, wanted)
+    if gone and not there:
+        return Missing(GONE, f"{said}: was seen, and later keyframes see through its place", _candidates(gone), usual)
+    if not there:
+        number = rows.objects_of(store.engine, wanted.classes, wanted.map_id)
+        hint = f" ({number} objects are no landmark: run semdb refine)" if number else ""
+        return Missing(NEVER_SEEN, f"{said}: never seen{hint}", (), usual)
+    if wanted.seen_after_ns is not None or wanted.seen_in is not None:
+        text = f"{said}: seen, but not since then; where it was has not been seen empty"
+        return Missing(NOT_LOOKED_AT, text, _candidates(there), usual)
+    return Missing(NEVER_SEEN, f"{said}: seen, but never so placed", _candidates(there), usual)
+
+
+def _candidates(listed: Sequence[Any]) -> tuple[Mapping[str, Any], ...]:
+    return tuple(
+        {
+            "landmark": int(row.id),
+            "map": row.map,
+            "category": row.category,
+            "position": [float(row.x), float(row.y), float(row.z)],
+            "last_seen": {
+                "recording": row.last_recording,
+                "frame_index": row.last_frame_index,
+                "timestamp_ns": row.last_seen_ns,
+            },
+        }
+        for row in listed
+    )
+
+
+def lines_of(found: Found) -> list[str]:
+    """What the command prints for people."""
+    lines = []
+    for part, item in found.understood.items():
+        classes = ", ".join(item["classes"])
+        if item["how"] != "class" or part != "what":
+            lines.append(f"{part}: {for_terminal(str(item['said']))} = {for_terminal(classes)}")
+    for hit in found.hits:
+        x, y, z = hit.position
+        away = "" if hit.distance is None else f", {hit.distance:.2f} m away"
+        seen = "" if hit.last_recording is None else f", last in {hit.last_recording} frame {hit.last_frame_index}"
+        lines.append(
+            for_terminal(
+                f"landmark {hit.landmark_id}: {hit.category} {hit.probability:.2f} at ({x:.2f}, {y:.2f}, {z:.2f}) in "
+                f"{hit.map}, {hit.state}, {hit.keyframes} keyframes{seen}{away}, score {hit.score:.2f}"
+            )
+        )
+    if found.missing is not None:
+        lines.append(for_terminal(found.missing.text))
+        for place in found.missing.usual:
+            lines.append(for_terminal(f"usually {place['relation']} {place['category']} ({place['count']} times)"))
+    return lines

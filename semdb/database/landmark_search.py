@@ -1,0 +1,271 @@
+"""Landmarks by class, by what they stand near or on, by when they were seen: one statement, the same on every server.
+
+Scores are computed by the database. Who asks gets the best few with all that is known of them, and where nothing is
+found, what is known of that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import Engine, Select, and_, case, exists, func, literal, or_, select
+from sqlalchemy.sql.elements import ColumnElement
+
+from semdb.database import retry
+from semdb.database.tables import (
+    categories,
+    keyframes,
+    landmark_relations,
+    landmark_sightings,
+    landmark_views,
+    landmarks,
+    maps,
+    objects,
+    recordings,
+)
+
+NEAR = ("near", "next_to", "on", "in")
+ON = ("on",)
+TENTATIVE = 0.5  # of the score of a confirmed landmark
+WALK_M = 5.0  # from the origin: a landmark so far away has half the score
+NOT_NEAR = 0.5  # a relation of this score is one
+MOST_SIGHTINGS = 20  # of a hit
+CONFIRMED, GONE = "confirmed", "gone"
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What is looked for, by names of classes; empty: not asked. `seen_in`: the name of a recording that shows it."""
+
+    classes: tuple[str, ...]
+    near: tuple[str, ...] = ()
+    on: tuple[str, ...] = ()
+    not_near: tuple[str, ...] = ()
+    map_id: int | None = None
+    seen_after_ns: int | None = None
+    seen_in: str | None = None
+    origin: tuple[float, float, float] | None = None
+    limit: int = 10
+
+
+def _ids_of(names: Sequence[str]) -> Any:
+    return select(categories.c.id).where(categories.c.name.in_(names))
+
+
+def _related(names: Sequence[str], kinds: Sequence[str]) -> Select[Any]:
+    """Relations of the landmark of the query around to any of the classes."""
+    r, o = landmark_relations.c, landmarks.alias("other")
+    return (
+        select(r.score)
+        .select_from(landmark_relations.join(o, o.c.id == r.other_landmark_id))
+        .where(r.landmark_id == landmarks.c.id, r.kind.in_(kinds), o.c.category_id.in_(_ids_of(names)))
+        .where(o.c.state != GONE)
+        .correlate(landmarks)
+    )
+
+
+def statement(wanted: Wanted) -> Select[Any]:
+    """The search as one statement: the best landmarks, the best first, with the parts of their scores."""
+    m = landmarks.c
+    conditions = _conditions(wanted)
+    one: ColumnElement[Any] = literal(1.0)
+    near = one if not wanted.near else _maximum(_related(wanted.near, NEAR))
+    on = one if not wanted.on else _maximum(_related(wanted.on, ON))
+    state = case((m.state == CONFIRMED, 1.0), else_=TENTATIVE)
+    squared: ColumnElement[Any] = literal(0.0)
+    if wanted.origin is not None:
+        x, y, z = wanted.origin
+        squared = (m.x - x) * (m.x - x) + (m.y - y) * (m.y - y) + (m.z - z) * (m.z - z)
+    scored = (
+        select(
+            m.id.label("landmark_id"),
+            m.probability.label("class_score"),
+            near.label("near_score"),
+            on.label("on_score"),
+            state.label("state_score"),
+            (WALK_M * WALK_M / (WALK_M * WALK_M + squared)).label("distance_score"),
+            squared.label("distance_squared"),
+        )
+        .where(*conditions)
+        .subquery("scored")
+    )
+    s = scored.c
+    score = (s.class_score * s.near_score * s.on_score * s.state_score * s.distance_score).label("score")
+    best = (
+        select(*s, score)
+        .where(s.near_score.is_not(None), s.on_score.is_not(None))
+        .order_by(score.desc(), s.landmark_id)
+        .limit(wanted.limit)
+        .subquery("best")
+    )
+    return _with_details(best)
+
+
+def _maximum(related: Select[Any]) -> ColumnElement[Any]:
+    """The highest score, null where there is none; correlated, so not through a table of its own."""
+    return related.with_only_columns(func.max(landmark_relations.c.score)).correlate(landmarks).scalar_subquery()
+
+
+def _conditions(wanted: Wanted, *, times: bool = True, gone: bool = False) -> list[ColumnElement[bool]]:
+    m = landmarks.c
+    found = [m.category_id.in_(_ids_of(wanted.classes)), m.state == GONE if gone else m.state != GONE]
+    if wanted.map_id is not None:
+        found.append(m.map_id == wanted.map_id)
+    if wanted.not_near:
+        there = _related(wanted.not_near, NEAR).where(landmark_relations.c.score >= NOT_NEAR)
+        found.append(~exists(there.with_only_columns(literal(1))))
+    if times and wanted.seen_after_ns is not None:
+        found.append(m.last_seen_ns >= wanted.seen_after_ns)
+    if times and wanted.seen_in is not None:
+        seen = (
+            select(literal(1))
+            .select_from(landmark_sightings.join(objects).join(keyframes, keyframes.c.id == objects.c.keyframe_id))
+            .join(recordings, recordings.c.id == keyframes.c.recording_id)
+            .where(landmark_sightings.c.landmark_id == m.id, recordings.c.name == wanted.seen_in)
+            .correlate(landmarks)
+        )
+        found.append(exists(seen))
+    return found
+
+
+def _with_details(best: Any) -> Select[Any]:
+    """The rows of `best` with names, box, last sighting and the view from which each is seen best."""
+    m, b = landmarks.c, best.c
+    last, last_of = keyframes.alias("last"), recordings.alias("last_of")
+    view, seen, at, at_of = (
+        landmark_views.alias("view"),
+        objects.alias("seen"),
+        keyframes.alias("at_"),
+        recordings.alias("at_of"),
+    )
+    joined = (
+        best.join(landmarks, m.id == b.landmark_id)
+        .join(categories, categories.c.id == m.category_id)
+        .join(maps, maps.c.id == m.map_id)
+        .outerjoin(last, last.c.id == m.last_keyframe_id)
+        .outerjoin(last_of, last_of.c.id == last.c.recording_id)
+        .outerjoin(view, and_(view.c.landmark_id == m.id, view.c.place == 0))
+        .outerjoin(seen, seen.c.id == view.c.object_id)
+        .outerjoin(at, at.c.id == seen.c.keyframe_id)
+        .outerjoin(at_of, at_of.c.id == at.c.recording_id)
+    )
+    columns = [column for column in m if column.name not in ("id", "appearance", "evidence", "category_id", "map_id")]
+    pose = [at.c[name].label(f"view_{name}") for name in ("qw", "qx", "qy", "qz", "tx", "ty", "tz")]
+    box = [seen.c[name].label(f"view_{name}") for name in ("x1", "y1", "x2", "y2")]
+    return (
+        select(*b, *columns, categories.c.name.label("category"), maps.c.name.label("map"))
+        .add_columns(last_of.c.name.label("last_recording"), last.c.frame_index.label("last_frame_index"))
+        .add_columns(at.c.id.label("view_keyframe_id"), at.c.frame_index.label("view_frame_index"))
+        .add_columns(at_of.c.name.label("view_recording"), view.c.distance.label("view_distance"), *pose, *box)
+        .select_from(joined)
+        .order_by(b.score.desc(), b.landmark_id)
+    )
+
+
+def as_text(engine: Engine, wanted: Wanted) -> str:
+    """The statement as this server gets it, values in place."""
+    return str(statement(wanted).compile(engine, compile_kwargs={"literal_binds": True}))
+
+
+def search(engine: Engine, wanted: Wanted) -> list[Any]:
+    """The rows of `statement`."""
+    query = statement(wanted)
+    return retry.read(engine, lambda connection: list(connection.execute(query)))
+
+
+def sightings_of(engine: Engine, ids: Sequence[int]) -> dict[int, list[Any]]:
+    """Up to `MOST_SIGHTINGS` sightings of each of a few landmarks, the clearest first."""
+    s, o, k = landmark_sightings.c, objects.c, keyframes.c
+    query = (
+        select(s.landmark_id, s.object_id, s.coverage, s.visibility, o.keyframe_id, o.score, categories.c.name)
+        .add_columns(recordings.c.name.label("recording"), k.frame_index)
+        .select_from(
+            landmark_sightings.join(objects, o.id == s.object_id)
+            .join(keyframes, k.id == o.keyframe_id)
+            .join(recordings, recordings.c.id == k.recording_id)
+            .join(categories, categories.c.id == o.category_id)
+        )
+        .where(s.landmark_id.in_([int(key) for key in ids]))
+    )
+    found: dict[int, list[Any]] = {int(key): [] for key in ids}
+    for row in retry.read(engine, lambda connection: list(connection.execute(query))):
+        found[int(row.landmark_id)].append(row)
+    for rows in found.values():
+        rows.sort(key=lambda row: (-row.visibility * row.coverage, row.recording, row.frame_index, row.object_id))
+        del rows[MOST_SIGHTINGS:]
+    return found
+
+
+def gone_ones(engine: Engine, wanted: Wanted, limit: int = 5) -> list[Any]:
+    """Landmarks of the wanted classes that were there and are gone, the last seen first."""
+    return _listed(engine, _conditions(wanted, times=False, gone=True), limit)
+
+
+def earlier_ones(engine: Engine, wanted: Wanted, limit: int = 5) -> list[Any]:
+    """Landmarks of the wanted classes whatever is asked of time, and of what they stand near or on."""
+    plain = Wanted(wanted.classes, map_id=wanted.map_id)
+    return _listed(engine, _conditions(plain, times=False), limit)
+
+
+def _listed(engine: Engine, conditions: Sequence[ColumnElement[bool]], limit: int) -> list[Any]:
+    m = landmarks.c
+    last, last_of = keyframes.alias("last"), recordings.alias("last_of")
+    query = (
+        select(m.id, categories.c.name.label("category"), maps.c.name.label("map"), m.x, m.y, m.z, m.last_seen_ns)
+        .add_columns(last_of.c.name.label("last_recording"), last.c.frame_index.label("last_frame_index"))
+        .select_from(
+            landmarks.join(categories, categories.c.id == m.category_id)
+            .join(maps, maps.c.id == m.map_id)
+            .outerjoin(last, last.c.id == m.last_keyframe_id)
+            .outerjoin(last_of, last_of.c.id == last.c.recording_id)
+        )
+        .where(*conditions)
+        .order_by(m.last_seen_ns.desc(), m.id)
+        .limit(limit)
+    )
+    return retry.read(engine, lambda connection: list(connection.execute(query)))
+
+
+def anchors(engine: Engine, names: Sequence[str], map_id: int | None) -> int:
+    """How many landmarks of these classes there are, gone or not."""
+    query = select(func.count()).select_from(landmarks).where(landmarks.c.category_id.in_(_ids_of(names)))
+    if map_id is not None:
+        query = query.where(landmarks.c.map_id == map_id)
+    return int(retry.read(engine, lambda connection: connection.execute(query).scalar()) or 0)
+
+
+def objects_of(engine: Engine, names: Sequence[str], map_id: int | None) -> int:
+    """How many objects of these classes keyframes show."""
+    query = select(func.count()).select_from(objects.join(keyframes).join(recordings))
+    query = query.where(objects.c.category_id.in_(_ids_of(names)))
+    if map_id is not None:
+        query = query.where(recordings.c.map_id == map_id)
+    return int(retry.read(engine, lambda connection: connection.execute(query).scalar()) or 0)
+
+
+def usual_places(engine: Engine, names: Sequence[str], limit: int = 5) -> list[tuple[str, str, int]]:
+    """On, in or beside what landmarks of these classes stand in this database: kind, class, how many; most first."""
+    r, other = landmark_relations.c, landmarks.alias("other")
+    number = func.count().label("number")
+    query = (
+        select(r.kind, categories.c.name, number)
+        .select_from(
+            landmark_relations.join(landmarks, landmarks.c.id == r.landmark_id)
+            .join(other, other.c.id == r.other_landmark_id)
+            .join(categories, categories.c.id == other.c.category_id)
+        )
+        .where(landmarks.c.category_id.in_(_ids_of(names)), r.score >= NOT_NEAR)
+        .where(or_(r.kind == "on", r.kind == "in", r.kind == "next_to"))
+        .group_by(r.kind, categories.c.name)
+        .order_by(number.desc(), r.kind.desc(), categories.c.name)
+        .limit(limit)
+    )
+    rows = retry.read(engine, lambda connection: list(connection.execute(query)))
+    return [(str(kind), str(name), int(count)) for kind, name, count in rows]
+
+
+def known_classes(engine: Engine) -> list[str]:
+    """Names of all classes."""
+    return [str(name) for name in retry.read(engine, lambda c: list(c.execute(select(categories.c.name)).scalars()))]

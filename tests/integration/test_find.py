@@ -1,0 +1,185 @@
+"""`semdb find` on every server: one statement, what words mean, and what is said where nothing is found."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from sqlalchemy import text
+from typer.testing import CliRunner
+
+from semdb.api.finding import find
+from semdb.cli.main import app
+from semdb.database.landmark_search import Wanted, statement
+from semdb.database.store import Store, open_store
+from semdb.errors import UsageError
+from semdb.exchange.formats import export_map
+from semdb.exchange.ply import EDGES, VERTEX
+from semdb.exchange.source import ExportOptions
+from semdb.landmarks.words import understand
+from tests.database_samples import fill, stored_landmarks
+from tests.query_plans import checked_plans
+
+CLASSES = ("chair", "cup", "dining table", "sink", "book", "banana")
+
+
+@pytest.fixture
+def landmarks(store: Store) -> list[int]:
+    """A table 0 with a cup 1 and a banana 5 on it and a chair 2 beside it, a sink 3 with a cup 4, a book 6."""
+    map_id, _, _ = fill(store)
+    return stored_landmarks(store, map_id)
+
+
+def found(store: Store, what: str, **asked: Any) -> list[int]:
+    return [hit.landmark_id for hit in find(store, what, **asked).hits]
+
+
+def test_by_class_and_by_what_is_near_or_below(store: Store, landmarks: list[int]) -> None:
+    table, cup, chair, sink, other_cup, banana, _ = landmarks
+    assert found(store, "cup") == [cup, other_cup]
+    assert found(store, "mug", near="sink") == [other_cup]
+    assert found(store, "cup", on="table") == [cup]
+    assert found(store, "cup", not_near="sink") == [cup]
+    assert found(store, "something to sit on", near="table") == [chair]
+    assert found(store, "fruit", map="room") == [banana]
+    assert found(store, "cup", origin=(-2, 0, 1), limit=1) == [other_cup]
+    assert found(store, "cup", origin=(2, 1, 1), limit=1) == [cup]
+    assert found(store, "furniture") == [table, chair]
+    assert found(store, "appliances") == [sink]
+
+
+def test_a_hit_has_all_that_is_known(store: Store, landmarks: list[int]) -> None:
+    answer = find(store, "cup", near="sink", origin=(-1.8, 0.3, 4.95))
+    (hit,) = answer.hits
+    assert hit.parts == pytest.approx({"class": 0.97, "near": 0.8, "state": 1.0, "distance": 25 / 41})
+    assert hit.score == pytest.approx(0.97 * 0.8 * 25 / 41)
+    assert hit.distance == pytest.approx(4)
+    assert hit.position == pytest.approx((-1.8, 0.3, 0.95))
+    assert hit.covariance == pytest.approx(np.eye(3) * 1e-4)
+    assert hit.viewpoint is not None
+    assert hit.viewpoint.distance == 1.5
+    assert hit.viewpoint.keyframe_id == hit.evidence[0].keyframe_id
+    assert hit.viewpoint.world_from_camera.shape == (4, 4)
+    assert answer.understood["near"] == {"said": "sink", "classes": ["sink"], "how": "class"}
+    assert answer.missing is None
+    with store.engine.connect() as connection:  # what --sql prints is what was asked
+        assert [row.landmark_id for row in connection.execute(text(answer.sql.replace(":", "\\:")))] == [landmarks[4]]
+    json.dumps(answer.as_dict())
+
+
+def test_when_it_was_seen(store: Store, landmarks: list[int]) -> None:
+    _, cup, _, _, other_cup, *_ = landmarks
+    assert found(store, "cup", seen_after=9 * 10**9) == [other_cup]
+    assert found(store, "cup", seen_after="first visit") == [cup, other_cup]
+    answer = find(store, "cup", seen_after="2030-01-01T00:00")
+    assert answer.missing is not None
+    assert answer.missing.reason == "not_looked_at"
+    assert [item["landmark"] for item in answer.missing.candidates] == [other_cup, cup]
+    with pytest.raises(UsageError, match="neither a time"):
+        find(store, "cup", seen_after="yesterday")
+
+
+def test_a_miss_says_which_of_three_it_is(store: Store, landmarks: list[int]) -> None:
+    def reason(what: str, **asked: Any) -> str | None:
+        missing = find(store, what, **asked).missing
+        return None if missing is None else missing.reason
+
+    assert reason("cup") is None
+    assert reason("toaster") == "never_seen"
+    assert reason("cup", near="toaster") == "not_looked_at"
+    with store.engine.begin() as connection:
+        connection.execute(text("UPDATE landmarks SET state = 'gone' WHERE id = :key"), {"key": landmarks[6]})
+    assert reason("book") == "gone"
+    usual = find(store, "cup", near="book").missing
+    assert usual is not None
+    assert usual.usual == ({"relation": "on", "category": "dining table", "count": 1},)
+
+
+def test_no_table_is_read_from_end_to_end(store: Store, landmarks: list[int]) -> None:
+    with store.engine.begin() as connection:
+        columns = "probability, evidence, x, y, z, cov_xx, cov_xy, cov_xz, cov_yy, cov_yz, cov_zz, size_x, size_y, "
+        columns += "size_z, yaw, sightings, keyframes, missed, seen_through, state"
+        query = f"INSERT INTO landmarks (map_id, category_id, {columns}) SELECT map_id, category_id, {columns} "
+        for _ in range(8):  # chairs, so that a class is a small part
+            connection.execute(
+                text(query + "FROM landmarks WHERE category_id = (SELECT id FROM categories WHERE name = 'chair')")
+            )
+        if store.engine.dialect.name != "sqlite":
+            connection.execute(text("ANALYZE TABLE landmarks"))
+    wanted = Wanted(("cup",), near=("sink",), map_id=1, origin=(0.0, 0.0, 0.0))
+    with checked_plans() as check, store.engine.connect() as connection:
+        assert len(connection.execute(statement(wanted)).all()) == 1
+    assert [scan for scan in check.full_scans if "landmarks" in scan.split("\n")[0]] == []
+
+
+@pytest.mark.parametrize(
+    ("said", "classes", "how"),
+    [
+        ("Cups", ("cup",), "class"),
+        ("a sofa", ("couch",), "synonym"),
+        ("drink from", ("cup", "wine glass", "bottle"), "use"),
+        ("heat-food", ("microwave", "oven", "toaster"), "use"),
+        ("something to eat", understand("food", ()).classes, "kind"),
+        ("knives", ("knife",), "class"),
+    ],
+)
+def test_words(said: str, classes: tuple[str, ...], how: str) -> None:
+    understood = understand(said, CLASSES)
+    assert (understood.classes, understood.how) == (classes, how)
+
+
+def test_a_word_that_means_nothing(store: Store, landmarks: list[int]) -> None:
+    with pytest.raises(UsageError, match=r"'chiar' is no class of this database.*did you mean chair"):
+        find(store, "chiar")
+    with pytest.raises(UsageError, match="three numbers"):
+        find(store, "cup", origin=(1.0, 2.0))
+
+
+def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with open_store("sqlite:///semdb.sqlite3", create=True) as store:
+        map_id, _, _ = fill(store)
+        stored_landmarks(store, map_id)
+
+    def run(*arguments: str, code: int = 0) -> str:
+        result = CliRunner().invoke(app, ["find", *arguments])
+        assert result.exit_code == code, result.output
+        return result.stdout
+
+    shown = run("mug", "--on", "table", "--from", "0,0,0")
+    assert "what: mug = cup" in shown
+    assert "landmark 2: cup 0.97 at (2.20, 1.10, 0.82) in room, confirmed" in shown
+    answer = json.loads(run("cup", "--near", "sink", "--json"))
+    assert set(answer) == {"understood", "hits", "missing"}
+    assert answer["hits"][0]["landmark"] == 5
+    missing = json.loads(run("toaster", "--json", code=1))
+    assert (missing["hits"], missing["missing"]["reason"]) == ([], "never_seen")
+    assert run("cup", "--sql").startswith("SELECT ")
+    run("cup", "--from", "here", code=2)
+    run("cup", "--plot", "pictures")
+    assert [path.name for path in (tmp_path / "pictures").iterdir()] == ["room-landmarks.png"]
+
+
+def test_exports(store: Store, landmarks: list[int], tmp_path: Path) -> None:
+    assert export_map(store, "landmarks", "room", tmp_path / "t.csv") == "7 landmarks"
+    lines = (tmp_path / "t.csv").read_text().splitlines()
+    assert len(lines) == 8
+    assert lines[1].startswith(f"{landmarks[0]},dining table,0.97,2.0,1.0,0.4,1.6,")
+    export_map(store, "landmarks", "room", tmp_path / "t.json")
+    whole = json.loads((tmp_path / "t.json").read_text())
+    assert (len(whole["landmarks"]), len(whole["relations"]), whole["floor"]) == (7, 5, 0.0)
+    export_map(store, "landmarks", "room", tmp_path / "t.geojson")
+    features = json.loads((tmp_path / "t.geojson").read_text())["features"]
+    ring = np.array(features[0]["geometry"]["coordinates"][0])
+    assert ring.shape == (5, 3)
+    assert ring[0] == pytest.approx(ring[4])
+    assert np.linalg.norm(ring[1] - ring[0]) == pytest.approx(1.6)
+    assert ring[:, 2] == pytest.approx(0.4 - 0.75 / 2)
+    with pytest.raises(UsageError, match=r"\.csv, \.json or \.geojson"):
+        export_map(store, "landmarks", "room", tmp_path / "t.xml")
+    assert VERTEX.itemsize == 15
+    assert EDGES.shape == (12, 2)
+    assert not ExportOptions().landmarks
