@@ -94,7 +94,10 @@ def opencv_step() -> Step:
 
 
 def open3d_step() -> Step | None:
-    """Open3D's `compute_rgbd_odometry` (hybrid), from the motion of the step before; None where it is not installed."""
+    """Open3D's `compute_rgbd_odometry` (hybrid) from no motion; None where it is not installed.
+
+    From the motion of the step before it ends metres farther off where one step failed.
+    """
     try:
         import open3d
     except (ImportError, OSError):
@@ -111,13 +114,13 @@ def open3d_step() -> Step | None:
             convert_rgb_to_intensity=True,
         )
 
-    def step(pair: Pair, motion: FloatArray) -> FloatArray | None:
+    def step(pair: Pair, _motion: FloatArray) -> FloatArray | None:
         camera = pair.camera
         intrinsic = open3d.camera.PinholeCameraIntrinsic(
             camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
         )
         good, found, _ = odometry.compute_rgbd_odometry(
-            rgbd(*pair.previous), rgbd(*pair.current), intrinsic, motion,
+            rgbd(*pair.previous), rgbd(*pair.current), intrinsic, np.eye(4),
             odometry.RGBDOdometryJacobianFromHybridTerm(), option,
         )  # fmt: skip
         return np.asarray(found, np.float64) if good else None

@@ -22,8 +22,8 @@ from semdb.types import FloatArray
 
 CHI2_MEDIAN = 5.348  # of six numbers
 # Errors of neighbours are alike, so squares of errors exceed what pairs of keyframes say of them by so much; fitted on
-# two rendered rooms
-SHARED_VARIANCE = 3.5
+# four rendered rooms and on red kitchen
+SHARED_VARIANCE = 6.0
 
 Progress = Callable[[str, int, int], None]
 
