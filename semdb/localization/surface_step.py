@@ -25,7 +25,8 @@ from semdb.types import FloatArray, Verdict
 WEIGHT_OF_SUPPORT = 0.25  # of the logarithm of keypoints against shares, where poses are compared
 LOGIT, LOGIT_OF_SUPPORT = 0.0, 1.5
 POINTS_PER_CELL = 60.0  # whose errors are alike: the depth's own, and of keyframes' poses
-POSE_SIGMA_M, POSE_SIGMA_RAD = 0.005, 0.003  # of what keyframes share: their recorded poses
+POSE_SIGMA_M, POSE_SIGMA_RAD = 0.006, 0.007  # of what keyframes share: recorded poses, clocks of colour and depth
+SCATTER = 4.0  # times what keyframes show that disagree: neighbours err alike
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,7 +206,7 @@ def covariance_of(fit: SurfaceFit) -> FloatArray:
     loose = np.diag([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])  # nothing is believed to be further off
     covariance = np.linalg.inv(fit.information / POINTS_PER_CELL + loose)
     shared = np.repeat([POSE_SIGMA_M, POSE_SIGMA_RAD], 3) ** 2
-    return np.asarray(covariance + np.diag(shared))
+    return np.asarray(covariance + np.diag(shared) + SCATTER * fit.scatter)
 
 
 def fused(

@@ -118,7 +118,9 @@ def test_without_overlap_there_is_no_pose() -> None:
 
 
 def fit_at(shift: float, near: float = 0.9, through: float = 0.0) -> SurfaceFit:
-    return SurfaceFit(pose((shift, 0, 0), (0, 0, 0)), np.eye(6) * 1e7, 1000, near, 0.9, 0.0, through, 0.9, 0.5)
+    return SurfaceFit(
+        pose((shift, 0, 0), (0, 0, 0)), np.eye(6) * 1e7, np.zeros((6, 6)), 1000, near, 0.9, 0.0, through, 0.9, 0.5
+    )
 
 
 def test_fits_of_one_pose_are_one() -> None:
