@@ -82,8 +82,16 @@ def bundle_adjust(
         rows=observed[:, 4],
         keyframe_from_world=np.stack([keyframe.camera_from_world for keyframe in keyframes]),
         looser=observed[:, 5],
+        keyframe_sigma=_pose_sigmas(keyframes),
     )
     return adjust(problem, camera_from_world, options.motion, rough=alignment is None, start=start)
+
+
+def _pose_sigmas(keyframes: Sequence[KeyframeView]) -> FloatArray | None:
+    """Standard deviations ``[c, 2]`` of place and turn, NaN where they are not known; None where none are."""
+    if all(keyframe.pose_sigma is None for keyframe in keyframes):
+        return None
+    return np.array([keyframe.pose_sigma or (np.nan, np.nan) for keyframe in keyframes])
 
 
 def _observations(

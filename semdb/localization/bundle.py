@@ -36,6 +36,7 @@ LEAST_STEP = 2e-5  # m and rad, of the query
 NORMAL_MEDIAN = 1.4826  # a normal distribution's standard deviation over its median distance
 IGNORED = 1e6  # times the noise: no weight
 FIXED = 1e-7  # a standard deviation (m, rad) that nothing moves
+MOST_LOOSER = 3.0  # times the usual prior that a keyframe's own standard deviation makes of it, or a third
 LEAST_DISTANCE = 0.02  # of a keyframe from the query (`pose_distances`), for the prior on its pose
 
 
@@ -74,6 +75,8 @@ class BundleProblem:
     keyframe_from_world: FloatArray  # [c - 1, 4, 4]
     looser: FloatArray | None = None  # [k] how many times the sensor's noise a depth has; None: once
     expected_turn: FloatArray | None = None  # [c, 3] of each image, the query first; None: none
+    # [c - 1, 2] standard deviations of each keyframe's place (m) and turn (rad), NaN where nobody knows; None: of all
+    keyframe_sigma: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,6 +143,16 @@ class _Solver:
         keyframes = np.stack([invert_pose(pose) for pose in self.problem.keyframe_from_world])
         distance = pose_distances(invert_pose(camera_from_world), keyframes)
         self.drift[1:, :6] = np.sqrt(np.maximum(distance, LEAST_DISTANCE))[:, None]
+
+    def doubting(self, prior: MotionPrior) -> None:
+        """Takes into account how sure the pose of each keyframe is, where that is known: against others of which it is
+        known, or that have the usual prior, it counts for more or less. How far all are off shows itself.
+        """
+        if self.problem.keyframe_sigma is None or not prior.keyframe_m or not prior.keyframe_rad:
+            return
+        times = self.problem.keyframe_sigma / [prior.keyframe_m, prior.keyframe_rad]
+        known = np.clip(np.where(np.isfinite(times), times, 1.0), 1 / MOST_LOOSER, MOST_LOOSER)
+        self.drift[1:, :6] *= np.repeat(known, 3, axis=1)
 
     def believe(self, sigma: FloatArray) -> None:
         """Makes `sigma` ``[3]`` (shift, rotation, turn of an image) those of the priors. The query's pose has none."""
@@ -266,6 +279,7 @@ def adjust(
     greatest = np.array([prior.keyframe_m, prior.keyframe_rad, prior.turn_rad])
     least = np.minimum(greatest, [prior.least_keyframe_m, prior.least_keyframe_rad, prior.least_turn_rad])
     solver.drifting(camera_from_world)
+    solver.doubting(prior)
     solver.believe(greatest)
     solver.observed[problem.observed_image == QUERY, 5] = IGNORED
     state, blocks, iterations = solver.minimise(state, FIRST_ITERATIONS)

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from semdb.database.links import load_covariances
 from semdb.database.records import StoredKeyframe
 from semdb.database.refinements import POINTS
 from semdb.database.store import Store
@@ -106,6 +107,7 @@ class KeyframeCache:
         if not missing:
             return
         refined = self._store.refined_points(missing, self._store.left_out) if self.points == USED else {}
+        sure = load_covariances(self._store.engine, missing, self._store.left_out)
         for stored in self._stored(missing):
             self._names[stored.id] = (stored.recording, stored.frame_index)
             try:
@@ -122,6 +124,7 @@ class KeyframeCache:
                 self.numbers,
                 self._grey(stored),
                 looser,
+                sure.get(stored.id),
             )
 
     def _stored(self, keyframe_ids: Sequence[int]) -> list[StoredKeyframe]:

@@ -56,6 +56,7 @@ class KeyframeView:
     world_from_camera: FloatArray
     camera_from_world: FloatArray
     world_points: FloatArray  # [n, 3]
+    pose_sigma: tuple[float, float] | None = None  # how sure the pose is, along an axis: metres, radians
 
 
 class ClassNumbers:
@@ -112,8 +113,9 @@ def make_keyframe_view(
     numbers: ClassNumbers,
     grey: ImageArray | None = None,
     looser: Float32Array | None = None,
+    covariance: FloatArray | None = None,
 ) -> KeyframeView:
-    """The view of a stored keyframe, with its points moved to the world."""
+    """The view of a stored keyframe, with its points moved to the world; `covariance` ``[6, 6]`` is of its pose."""
     view = make_view(camera, keypoints, object_categories, numbers, with_points_only=True, grey=grey, looser=looser)
     return KeyframeView(
         keyframe_id=keyframe_id,
@@ -121,4 +123,11 @@ def make_keyframe_view(
         world_from_camera=world_from_camera,
         camera_from_world=invert_pose(world_from_camera),
         world_points=transform_points(world_from_camera, view.points),
+        pose_sigma=None if covariance is None else _sigma_of(covariance),
     )
+
+
+def _sigma_of(covariance: FloatArray) -> tuple[float, float]:
+    """Standard deviations along an axis of translation and of rotation."""
+    place, turn = (float(np.sqrt(np.trace(covariance[part, part]) / 3)) for part in (slice(0, 3), slice(3, 6)))
+    return place, turn

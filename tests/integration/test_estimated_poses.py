@@ -17,6 +17,7 @@ from semdb.database.store import open_store
 from semdb.errors import RecordingError, UsageError
 from semdb.evaluation.trajectory_errors import trajectory_errors
 from semdb.ingestion.queue import Workplace
+from semdb.localization.keyframe_cache import KeyframeCache
 from semdb.recordings import open_recording
 from semdb.settings import Settings
 from semdb.types import FloatArray
@@ -60,6 +61,9 @@ def test_a_map_without_poses_on_every_server(open_db: Opening, walk: tuple[Path,
     covariances = load_covariances(store.engine, ids)
     assert list(covariances) == ids
     assert all(np.sqrt(np.trace(value[:3, :3])) < 0.05 for value in covariances.values())
+    [view] = KeyframeCache(store, store.find_map("walk").id).views(ids[-1:])
+    assert view.pose_sigma is not None  # the fine step's prior on its pose
+    assert 0 < view.pose_sigma[0] < 0.05
     odometry = [link for link in list_links(store.engine) if link.kind is LinkKind.ODOMETRY]
     assert [(link.first, link.second) for link in odometry] == list(pairwise(ids))
     # once more, and with more keyframes: poses are those of the plan

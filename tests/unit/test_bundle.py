@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -161,6 +162,23 @@ def test_a_keyframe_near_the_query_holds_it_more_than_one_far_off(monkeypatch: p
     monkeypatch.setattr(_Solver, "drifting", lambda solver, pose: None)
     alike = [error_of(problem, truth)[0] for problem, truth in problems]
     assert np.mean(errors) < 0.9 * np.mean(alike)
+
+
+def test_a_keyframe_whose_pose_is_known_to_be_off_counts_less() -> None:
+    """Of two keyframes as far away the pose of one is off by 15 mm, and that is known."""
+    errors, unknown = [], []
+    for seed in range(30):
+        problem, truth = problem_of(seed, keyframes=2, pixel_noise=0.3)
+        random = np.random.default_rng(seed + 100)
+        recorded = problem.keyframe_from_world.copy()
+        recorded[1, :3, 3] += random.normal(size=3) * 0.015
+        problem = replace(problem, keyframe_from_world=recorded)
+        unknown.append(error_of(problem, truth)[0])
+        known = replace(problem, keyframe_sigma=np.array([[0.002, 0.001], [0.015, np.nan]]))
+        errors.append(error_of(known, truth)[0])
+        usual = replace(problem, keyframe_sigma=np.full((2, 2), np.nan))
+        assert error_of(usual, truth)[0] == unknown[-1]
+    assert np.mean(errors) < 0.7 * np.mean(unknown)
 
 
 def test_depth_that_disagrees_is_believed_less() -> None:
