@@ -6,17 +6,20 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from semdb.database import checked
 from semdb.database.keyframe_rows import pose_of
 from semdb.door.found import Evidence, Found, FoundLandmark, Missing, Viewpoint
-from semdb.errors import CodecError, UsageError
+from semdb.errors import CodecError, NotFoundError, UsageError
+from semdb.names import storable
 from semdb.shown import for_terminal
 from semdb.types import FloatArray
 
 if TYPE_CHECKING:
     from semdb.database.landmark_search import Wanted
+    from semdb.database.records import MapHead
     from semdb.database.store import Store
     from semdb.landmarks.words import Understood
 
@@ -45,7 +48,7 @@ def find(
     known = rows.known_classes(store.engine)
     asked = {"what": what, "near": near, "on": on, "not_near": not_near}
     meant = {name: understand(word, known) for name, word in asked.items() if word is not None}
-    info = None if map is None else store.find_map(map)
+    info = None if map is None else _map(store, map)
     after_ns, seen_in = _seen_after(store, seen_after, None if info is None else info.id)
     wanted = rows.Wanted(
         classes=meant["what"].classes,
@@ -65,7 +68,16 @@ def find(
         name: {"said": item.said, "classes": list(item.classes), "how": item.how} for name, item in meant.items()
     }
     missing = None if hits else _missing(store, wanted, meant)
-    return Found(understood, hits, missing, rows.as_text(store.engine, wanted))
+    return Found(understood, hits, missing, partial(rows.as_text, store.engine, wanted))
+
+
+def _map(store: Store, name: str) -> MapHead:
+    """A map by name, at the price of small queries. Raises NotFoundError, which names those that there are."""
+    for head in store.map_heads():
+        if head.name == storable(name):
+            return head
+    store.find_map(name)
+    raise NotFoundError(f"there is no map {name!r}")
 
 
 def _classes(meant: Mapping[str, Understood], name: str) -> tuple[str, ...]:

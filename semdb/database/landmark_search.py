@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
-from sqlalchemy import Engine, Select, and_, case, exists, func, literal, or_, select
+from sqlalchemy import Double, Engine, Integer, Select, and_, bindparam, case, exists, func, literal, or_, select
 from sqlalchemy.sql.elements import ColumnElement
 
 from semdb.database import retry
@@ -50,11 +51,44 @@ class Wanted:
     limit: int = 10
 
 
-def _ids_of(names: Sequence[str]) -> Any:
-    return select(categories.c.id).where(categories.c.name.in_(names))
+@dataclass(frozen=True, slots=True)
+class _Shape:
+    """What a search asks for, without the values: such statements are made once."""
+
+    near: bool
+    on: bool
+    not_near: bool
+    map_id: bool
+    seen_after_ns: bool
+    seen_in: bool
+    origin: bool
 
 
-def _related(names: Sequence[str], kinds: Sequence[str]) -> Select[Any]:
+def _shape(wanted: Wanted) -> _Shape:
+    return _Shape(
+        *(bool(wanted.near), bool(wanted.on), bool(wanted.not_near), wanted.map_id is not None),
+        *(wanted.seen_after_ns is not None, wanted.seen_in is not None, wanted.origin is not None),
+    )
+
+
+def _values(wanted: Wanted) -> dict[str, Any]:
+    """The values of the parameters of its statement."""
+    shape, found = _shape(wanted), {"classes": list(wanted.classes), "most": wanted.limit}
+    found |= {name: list(getattr(wanted, name)) for name in ("near", "on", "not_near") if getattr(shape, name)}
+    names = ("map_id", "seen_after_ns", "seen_in")
+    found |= {name: getattr(wanted, name) for name in names if getattr(shape, name)}
+    if wanted.origin is not None:
+        found |= dict(zip(("from_x", "from_y", "from_z"), wanted.origin, strict=True))
+    return found
+
+
+def _ids_of(names: str | Sequence[str]) -> Any:
+    """Ids of classes by their names, or by those of a parameter."""
+    listed: Any = bindparam(names, expanding=True) if isinstance(names, str) else names
+    return select(categories.c.id).where(categories.c.name.in_(listed))
+
+
+def _related(names: str, kinds: Sequence[str]) -> Select[Any]:
     """Relations of the landmark of the query around to any of the classes."""
     r, o = landmark_relations.c, landmarks.alias("other")
     return (
@@ -68,15 +102,20 @@ def _related(names: Sequence[str], kinds: Sequence[str]) -> Select[Any]:
 
 def statement(wanted: Wanted) -> Select[Any]:
     """The search as one statement: the best landmarks, the best first, with the parts of their scores."""
+    return _statement(_shape(wanted)).params(**_values(wanted))
+
+
+@lru_cache(maxsize=128)
+def _statement(wanted: _Shape) -> Select[Any]:
     m = landmarks.c
     conditions = _conditions(wanted)
     one: ColumnElement[Any] = literal(1.0)
-    near = one if not wanted.near else _maximum(_related(wanted.near, NEAR))
-    on = one if not wanted.on else _maximum(_related(wanted.on, ON))
+    near = one if not wanted.near else _maximum(_related("near", NEAR))
+    on = one if not wanted.on else _maximum(_related("on", ON))
     state = case((m.state == CONFIRMED, 1.0), else_=TENTATIVE)
     squared: ColumnElement[Any] = literal(0.0)
-    if wanted.origin is not None:
-        x, y, z = wanted.origin
+    if wanted.origin:
+        x, y, z = (bindparam(name, type_=Double) for name in ("from_x", "from_y", "from_z"))
         squared = (m.x - x) * (m.x - x) + (m.y - y) * (m.y - y) + (m.z - z) * (m.z - z)
     scored = (
         select(
@@ -97,7 +136,7 @@ def statement(wanted: Wanted) -> Select[Any]:
         select(*s, score)
         .where(s.near_score.is_not(None), s.on_score.is_not(None))
         .order_by(score.desc(), s.landmark_id)
-        .limit(wanted.limit)
+        .limit(bindparam("most", type_=Integer))
         .subquery("best")
     )
     return _with_details(best)
@@ -108,22 +147,22 @@ def _maximum(related: Select[Any]) -> ColumnElement[Any]:
     return related.with_only_columns(func.max(landmark_relations.c.score)).correlate(landmarks).scalar_subquery()
 
 
-def _conditions(wanted: Wanted, *, times: bool = True, gone: bool = False) -> list[ColumnElement[bool]]:
+def _conditions(wanted: _Shape, *, gone: bool = False) -> list[ColumnElement[bool]]:
     m = landmarks.c
-    found = [m.category_id.in_(_ids_of(wanted.classes)), m.state == GONE if gone else m.state != GONE]
-    if wanted.map_id is not None:
-        found.append(m.map_id == wanted.map_id)
+    found = [m.category_id.in_(_ids_of("classes")), m.state == GONE if gone else m.state != GONE]
+    if wanted.map_id:
+        found.append(m.map_id == bindparam("map_id"))
     if wanted.not_near:
-        there = _related(wanted.not_near, NEAR).where(landmark_relations.c.score >= NOT_NEAR)
+        there = _related("not_near", NEAR).where(landmark_relations.c.score >= NOT_NEAR)
         found.append(~exists(there.with_only_columns(literal(1))))
-    if times and wanted.seen_after_ns is not None:
-        found.append(m.last_seen_ns >= wanted.seen_after_ns)
-    if times and wanted.seen_in is not None:
+    if wanted.seen_after_ns:
+        found.append(m.last_seen_ns >= bindparam("seen_after_ns"))
+    if wanted.seen_in:
         seen = (
             select(literal(1))
             .select_from(landmark_sightings.join(objects).join(keyframes, keyframes.c.id == objects.c.keyframe_id))
             .join(recordings, recordings.c.id == keyframes.c.recording_id)
-            .where(landmark_sightings.c.landmark_id == m.id, recordings.c.name == wanted.seen_in)
+            .where(landmark_sightings.c.landmark_id == m.id, recordings.c.name == bindparam("seen_in"))
             .correlate(landmarks)
         )
         found.append(exists(seen))
@@ -200,16 +239,15 @@ def sightings_of(engine: Engine, ids: Sequence[int]) -> dict[int, list[Any]]:
 
 def gone_ones(engine: Engine, wanted: Wanted, limit: int = 5) -> list[Any]:
     """Landmarks of the wanted classes that were there and are gone, the last seen first."""
-    return _listed(engine, _conditions(wanted, times=False, gone=True), limit)
+    return _listed(engine, Wanted(wanted.classes, map_id=wanted.map_id, limit=limit), gone=True)
 
 
 def earlier_ones(engine: Engine, wanted: Wanted, limit: int = 5) -> list[Any]:
     """Landmarks of the wanted classes whatever is asked of time, and of what they stand near or on."""
-    plain = Wanted(wanted.classes, map_id=wanted.map_id)
-    return _listed(engine, _conditions(plain, times=False), limit)
+    return _listed(engine, Wanted(wanted.classes, map_id=wanted.map_id, limit=limit), gone=False)
 
 
-def _listed(engine: Engine, conditions: Sequence[ColumnElement[bool]], limit: int) -> list[Any]:
+def _listed(engine: Engine, wanted: Wanted, *, gone: bool) -> list[Any]:
     m = landmarks.c
     last, last_of = keyframes.alias("last"), recordings.alias("last_of")
     query = (
@@ -221,9 +259,10 @@ def _listed(engine: Engine, conditions: Sequence[ColumnElement[bool]], limit: in
             .outerjoin(last, last.c.id == m.last_keyframe_id)
             .outerjoin(last_of, last_of.c.id == last.c.recording_id)
         )
-        .where(*conditions)
+        .where(*_conditions(_shape(wanted), gone=gone))
         .order_by(m.last_seen_ns.desc(), m.id)
-        .limit(limit)
+        .limit(bindparam("most", type_=Integer))
+        .params(**_values(wanted))
     )
     return retry.read(engine, lambda connection: list(connection.execute(query)))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -134,7 +134,12 @@ class Found:
     understood: Mapping[str, Mapping[str, Any]]
     hits: tuple[FoundLandmark, ...]
     missing: Missing | None
-    sql: str = field(repr=False)
+    statement: Callable[[], str] = field(repr=False)
+
+    @property
+    def sql(self) -> str:
+        """The statement that the database was asked, values in place."""
+        return self.statement()
 
     def as_dict(self) -> dict[str, Any]:
         """What JSON has."""

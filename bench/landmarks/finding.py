@@ -1,0 +1,104 @@
+"""How long `semdb find` takes in a database of many landmarks.
+
+``python -m bench.landmarks.finding [--landmarks N] [--url URL]``. Made-up landmarks of 80 classes in maps of 1000, each
+with ten relations; URL is that of an empty database with the schema (default: a temporary SQLite file).
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from sqlalchemy import insert, select
+
+from semdb.api.finding import find
+from semdb.database import tables
+from semdb.database.ids import SharedIds
+from semdb.database.store import Store, open_store
+
+KINDS = ("near", "next_to", "on", "under", "above")
+QUESTIONS = (
+    {},
+    {"near": "class 7"},
+    {"on": "class 9"},
+    {"near": "class 3", "not_near": "class 5", "origin": (1, 2, 0)},
+)
+
+
+def fill(store: Store, number: int, per_map: int = 1000) -> None:
+    """Writes `number` landmarks."""
+    rng = np.random.default_rng(0)
+    names = [f"class {k}" for k in range(80)]
+    ids = SharedIds(store.engine).categories(names)
+    keys = [ids[name] for name in names]
+    made = 0
+    for k in range(-(-number // per_map)):
+        map_id = store.ensure_map(f"map {k}")
+        count = min(per_map, number - made)
+        places = rng.uniform(-20, 20, (count, 3))
+        zeros = dict.fromkeys(tables.COVARIANCE_COLUMNS, 0.0)
+        rows = [
+            {
+                **{"id": made + n + 1, "map_id": map_id, "category_id": keys[int(rng.integers(80))]},
+                **{"probability": float(rng.uniform(0.5, 1)), "evidence": "{}", **zeros},
+                **dict(zip("xyz", map(float, places[n]), strict=True)),
+                **{"size_x": 0.3, "size_y": 0.3, "size_z": 0.3, "yaw": 0.0, "sightings": 4, "keyframes": 4},
+                **{"missed": 0, "seen_through": 0, "state": "confirmed"},
+            }
+            for n in range(count)
+        ]
+        related = {
+            (made + n + 1, KINDS[int(rng.integers(5))], made + int(rng.integers(count)) + 1)
+            for n in range(count)
+            for _ in range(10)
+        }
+        with store.engine.begin() as connection:
+            connection.execute(insert(tables.landmarks), rows)
+            connection.execute(
+                insert(tables.landmark_relations),
+                [
+                    {"landmark_id": a, "kind": kind, "other_landmark_id": b, "score": float(rng.uniform(0.3, 1))}
+                    for a, kind, b in sorted(related)
+                ],
+            )
+        made += count
+
+
+def measure(store: Store, questions: int = 200) -> list[float]:
+    """Milliseconds of each of so many questions, in one map and in all."""
+    rng = np.random.default_rng(1)
+    maps = [info.name for info in store.maps()]
+    taken = []
+    for k in range(questions):
+        asked = dict(QUESTIONS[k % len(QUESTIONS)])
+        if k % 8 < 6:
+            asked["map"] = maps[int(rng.integers(len(maps)))]
+        start = time.perf_counter()
+        find(store, f"class {int(rng.integers(80))}", **asked)  # type: ignore[arg-type]
+        taken.append((time.perf_counter() - start) * 1000)
+    return taken
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--landmarks", type=int, default=100_000)
+    parser.add_argument("--url")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        url = given.url or f"sqlite:///{Path(folder) / 'landmarks.sqlite3'}"
+        with open_store(url, create=True) as store:
+            with store.engine.connect() as connection:
+                empty = connection.execute(select(tables.landmarks.c.id).limit(1)).first() is None
+            if empty:
+                fill(store, given.landmarks)
+            measure(store, 8)
+            taken = measure(store)
+    for name, part in (("in one map", [t for k, t in enumerate(taken) if k % 8 < 6]), ("in all maps", taken[6::8])):
+        print(f"{name}: p50 {np.percentile(part, 50):.1f} ms, p95 {np.percentile(part, 95):.1f} ms")
+
+
+if __name__ == "__main__":
+    main()
