@@ -263,7 +263,11 @@ class Localizing(Base):
             return LikeCamera(camera, depth_scale, f"recording {name!r}")
         if Path(name).exists():
             return self._here.on_disk().camera_like(Path(name))
-        raise UsageError(f"--like {name}: neither a recording in the database nor a folder")
+        known = sorted({recording.name for entry in maps for recording in store.status(entry.head.id)})
+        raise UsageError(
+            f"like {name}: there is neither a recording of that name in the database nor such a folder; "
+            f"recordings: {', '.join(known[:10])}{', ...' if len(known) > 10 else ''}"
+        )
 
     def _log(self, store: Store, maps: Sequence[OpenMap], image: str, localization: Localization) -> None:
         """An answer is given also where it cannot be logged, as with an account that may only read."""

@@ -160,10 +160,10 @@ class Reading(Base):
         DatabaseError where the database refuses it or the time limit ``SEMDB_SQL_TIME_LIMIT_S`` is over, also while
         rows are fetched.
         """
-        from semdb.database.readonly import run_readonly
+        from semdb.database.catalogue import ask
 
         self._here.check_open()
-        return Rows(*run_readonly(self.settings, statement))
+        return Rows(*ask(self.settings, statement))
 
     def tables(self) -> dict[str, tuple[str, ...]]:
         """The columns of each table and view that `sql` can ask. Raises what `sql` raises."""

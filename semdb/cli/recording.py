@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -133,6 +133,13 @@ def comparison_lines(found: PoseComparison | str | None) -> list[str]:
     return [f"{label:<12} {text}" for label, text in rows]
 
 
+def no_poses(found: Mapping[str, Any]) -> str:
+    """What is to be said of a recording without poses; `found` are its counts."""
+    if not found["with_depth"]:
+        return "no poses, and no depth that they could be estimated from"
+    return "no poses: `semdb ingest` estimates them from images and depth, `semdb trajectory` alone, too"
+
+
 def comparison_json(found: PoseComparison | str | None) -> dict[str, Any]:
     """What `--trajectory --json` adds: metres and degrees, null where they are not known."""
     if found is None:
@@ -230,7 +237,7 @@ def as_lines(recording: Recording, quick: bool) -> list[str]:
         ("camera", describe_camera(recording.camera)),
         ("depth scale", f"{number(recording.depth_scale)} per metre{registered}"),
         ("masks", f"{found['with_masks']} frames" if found["with_masks"] else "none"),
-        ("trajectory", f"{measure(recording.trajectory_length(), 2)} m"),
+        ("trajectory", f"{measure(recording.trajectory_length(), 2)} m" if found["with_pose"] else no_poses(found)),
         *(("holds", line) for line in recording.contents),
         *(("note", note) for note in recording.notes if note not in recording.assumed),
         *(("assumed", line) for line in recording.assumed),

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
-from semdb.database.readonly import file_of, run_readonly
+import difflib
+import re
+from collections.abc import Generator
+
+from semdb.database.readonly import Row, file_of, run_readonly
 from semdb.database.readonly_sqlite import read_own
+from semdb.errors import DatabaseError, SemdbError
 from semdb.settings import Settings
 
 _OWN = "alembic_version"  # of the migrations, not of users
+_NO_TABLE = re.compile(
+    r"no such table: (?:main\.)?(\w+)|Table '(?:[^'.]*\.)?([^'.]+)' doesn't exist"
+)  # SQLite; servers
 _FILE = (
     "SELECT m.name, c.name FROM sqlite_master m, pragma_table_info(m.name) c WHERE m.type IN ('table', 'view') "
     f"AND m.name NOT LIKE 'sqlite%' AND m.name <> '{_OWN}' ORDER BY m.name, c.cid"
@@ -24,3 +32,20 @@ def tables_and_columns(settings: Settings) -> dict[str, tuple[str, ...]]:
     for table, column in run_readonly(settings, _SERVER)[1] if file is None else read_own(file, _FILE):
         found[str(table)] = (*found.get(str(table), ()), str(column))
     return found
+
+
+def ask(settings: Settings, sql: str) -> tuple[tuple[str, ...], Generator[Row, None, None]]:
+    """As `run_readonly`, and an error of a table that is not there names those that are called alike."""
+    try:
+        return run_readonly(settings, sql)
+    except DatabaseError as error:
+        missing = _NO_TABLE.search(str(error))
+        if missing is None:
+            raise
+        try:
+            known = tables_and_columns(settings)
+        except SemdbError:  # the first error is the one to tell
+            raise error from None
+        alike = difflib.get_close_matches(missing.group(1) or missing.group(2), known)
+        hint = f"alike are {', '.join(alike)}" if alike else "\\d in `semdb sql` lists tables and views"
+        raise DatabaseError(f"{error}; {hint}") from error

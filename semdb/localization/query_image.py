@@ -144,6 +144,8 @@ class QueryReader:
             recording, entry = found
             pose, index, time = entry.world_from_camera, entry.index, entry.timestamp_ns
             instances = recording.read_instances(entry)
+        if header.bits == 16 and header.channels == 1:
+            self._tell(f"{name} has one channel of 16 bits, as depth images have; it is taken for a grey image")
         if orientation_of(data) > 1:
             self._tell(
                 f"{name} has an orientation mark, which is not applied: intrinsics belong to the pixels as stored"

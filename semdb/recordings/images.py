@@ -228,6 +228,7 @@ def decode_16bit(data: bytes, name: str, size: tuple[int, int], what: str = "a d
         channels = 1 if image.ndim == 2 else image.shape[2]
         raise FrameError(
             f"{name}: {what} needs one channel of 16 bits, this has {channels} of {image.dtype.itemsize * 8} bits"
+            f"{', as colour images have' if channels >= 3 else ''}"
         )
     if image.shape != (size[1], size[0]):
         raise FrameError(

@@ -14,7 +14,7 @@ from sqlalchemy import text
 from sqlalchemy.engine import make_url
 
 from semdb.database import accounts, schema
-from semdb.database.catalogue import tables_and_columns
+from semdb.database.catalogue import ask, tables_and_columns
 from semdb.database.engine import make_engine
 from semdb.database.readonly import run_readonly
 from semdb.database.readonly_server import excess_rights
@@ -173,6 +173,10 @@ def test_slow_queries_are_ended(settings: Settings) -> None:
 def test_mistakes_are_told(settings: Settings) -> None:
     with pytest.raises(DatabaseError, match=r"refused the statement.*no_such_table"):
         run_readonly(settings, "SELECT * FROM no_such_table")
+    with pytest.raises(DatabaseError, match=r"refused the statement.*landmark_lst.*; alike are landmark_list"):
+        ask(settings, "SELECT * FROM landmark_lst")
+    with pytest.raises(DatabaseError, match=r"refused the statement.*; \\d in `semdb sql` lists tables and views$"):
+        ask(settings, "SELECT * FROM zzzzzz")
     with pytest.raises(UsageError, match="only queries can be run here"):
         run_readonly(settings, "DELETE FROM maps")
 

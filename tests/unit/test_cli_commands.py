@@ -21,6 +21,7 @@ from semdb.database.store import open_store
 from semdb.recordings import DroppedFrame
 from tests.database_samples import fill, plan
 from tests.unit.onnx_files import write_constant_model
+from tests.unit.recording_miniatures import write_tum
 
 
 @pytest.fixture(autouse=True)
@@ -56,6 +57,16 @@ def test_init_creates_then_says_it_is_up_to_date(tmp_path: Path) -> None:
     assert "up to date" in run("init").stdout
     assert "created" in run("init", "--database-url", "sqlite:///other.sqlite3").stdout
     assert (tmp_path / "other.sqlite3").is_file()
+
+
+def test_a_recording_without_poses_names_the_commands_that_find_them(tmp_path: Path) -> None:
+    walk = write_tum(tmp_path / "walk", n=3)
+    assert "trajectory   0." in run("recording", str(walk), "--quick").stdout
+    (walk / "groundtruth.txt").unlink()
+    assert (
+        "trajectory   no poses: `semdb ingest` estimates them from images and depth, `semdb trajectory` alone, too"
+        in run("recording", str(walk), "--quick").stdout
+    )
 
 
 def test_init_upgrades_an_older_schema() -> None:

@@ -191,6 +191,15 @@ def test_what_is_unlikely_or_shows_nothing_is_said(tmp_path: Path) -> None:
     assert said[1] == "q: the colour image is nearly black"
 
 
+def test_a_depth_image_in_the_place_of_the_image_is_named(tmp_path: Path) -> None:
+    said: list[str] = []
+    cv2.imwrite(str(tmp_path / "d.png"), (1000 + np.arange(48 * 64) % 977).reshape(48, 64).astype(np.uint16))
+    reader(MAP, said).read(str(tmp_path / "d.png"))
+    assert said == [
+        f"{tmp_path / 'd.png'} has one channel of 16 bits, as depth images have; it is taken for a grey image"
+    ]
+
+
 def test_impossible_depth_scales_are_usage_errors(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "d.png"), np.ones((48, 64), np.uint16))
     own = QueryReader(camera=MAP, known=lambda: [MAP], depth_scale=0.001)

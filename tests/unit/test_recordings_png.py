@@ -100,7 +100,9 @@ def test_other_kinds_are_left_to_opencv(pixels: Pixels) -> None:
 def test_depth_read_as_colour_and_colour_as_depth() -> None:
     deep = file_of(DEPTH, filtered(DEPTH, [4]))
     np.testing.assert_array_equal(decode_color(deep, "a.png")[..., 0], (DEPTH.astype(int) / 256).astype(np.uint8))
-    with pytest.raises(FrameError, match=r"a\.png: a depth image needs one channel of 16 bits, this has 3 of 8 bits"):
+    with pytest.raises(
+        FrameError, match=r"a\.png: a depth image needs one channel of 16 bits, this has 3 of 8 bits, as colour"
+    ):
         decode_16bit(file_of(RGB, filtered(RGB, [1])), "a.png", (7, 5))
 
 
