@@ -70,10 +70,15 @@ def command(
     """
     from semdb.cli.localized import Tally, trajectory_file
     from semdb.cli.output import print_lines
+    from semdb.errors import UsageError
 
     groups = grouped(sources)
     check_options(groups, depth or [], query_depth, reading, trajectory)
     if plot is not None:
+        if plot.suffix.lower() in (".png", ".jpg", ".jpeg") and not plot.is_dir():
+            raise UsageError(
+                f"--plot {plot}: is the name of a picture, but pictures are written into a folder: name one"
+            )
         plot.mkdir(parents=True, exist_ok=True)
     tally = Tally()
     asked = Asked(map_name, tuple(depth or ()), like, camera, reading, every, query_depth, coarse)

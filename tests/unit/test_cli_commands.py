@@ -69,6 +69,11 @@ def test_a_recording_without_poses_names_the_commands_that_find_them(tmp_path: P
     )
 
 
+def test_a_picture_as_the_folder_for_pictures_is_refused(tmp_path: Path) -> None:
+    assert "--plot out.png: is the name of a picture" in run("localize", "a.png", "--plot", "out.png", code=2).stderr
+    assert not (tmp_path / "out.png").exists()
+
+
 def test_init_upgrades_an_older_schema() -> None:
     from semdb.database.engine import make_engine
 
