@@ -39,6 +39,7 @@ from semdb.perception.model_choice import settings_of_map, specs_for_query
 from semdb.pictures import localization as pictures
 from semdb.recordings.synthetic import SyntheticOptions
 from semdb.refinement.run import refine_map
+from semdb.refinement.steps import FOR_LOCALIZATION
 from semdb.settings import Settings
 from semdb.types import Description, Localization
 from tests.rooms import render
@@ -89,7 +90,7 @@ def make(folder: Path) -> None:
     ingest_recordings([room], settings(folder), IngestOptions(map_name="m", keyframes=KEYFRAMES))
     with open_store(settings(folder).database_url) as store:
         info = store.find_map("m")
-        refine_map(store, info)
+        refine_map(store, info, kinds=FOR_LOCALIZATION)
         names = [name for _, name in store.map_categories(info.id)]
         with store.engine.begin() as connection:
             ids = [key for key, _ in store.map_categories(info.id)]
@@ -398,7 +399,8 @@ class Reader:
         return total
 
     def refine(self, store: Store) -> Any:
-        results = [refine_map(store, info, force=True) for info in store.maps() if info.keyframes]
+        kinds = FOR_LOCALIZATION  # landmarks take as long as all else
+        results = [refine_map(store, info, kinds=kinds, force=True) for info in store.maps() if info.keyframes]
         return [result.rows for found in results for result in found]
 
 

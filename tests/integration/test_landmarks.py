@@ -185,3 +185,23 @@ def test_ids_go_to_whoever_shares_most() -> None:
     kept = keep_ids({1: 7, 2: 7, 3: 7, 4: 8, 5: 9}, [[1, 9], [2, 3, 4], [5, 6], [11]])
     assert kept.ids == (None, 7, 9, None)
     assert kept.merged == {8: 1}
+
+
+def test_damaged_rows_are_left_out_aloud(store: Store) -> None:
+    info = ingest(store, range(4))
+    said: list[str] = []
+    told = Store(store.engine, said.append)
+    whole = refine(told, info)
+    heads = {head.frame_index: head.id for head in store.keyframe_heads(info.id)}
+    with store.engine.begin() as connection:
+        broken = {"key": heads[1], "bytes": b"no picture"}
+        connection.execute(text("UPDATE keyframe_images SET depth = :bytes WHERE keyframe_id = :key"), broken)
+        connection.execute(
+            text("UPDATE objects SET mask = :bytes WHERE keyframe_id = :key AND ordinal = 0"),
+            {"key": heads[2], "bytes": b"no mask"},
+        )
+    assert 0 < refine(told, info, force=True) <= whole
+    assert any("keyframe_images.depth" in line for line in said)
+    assert any("objects.mask" in line for line in said)
+    shown = {sighting[1] for sightings in things(store).values() for sighting in sightings}
+    assert shown == {0, 3}
