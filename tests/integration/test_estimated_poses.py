@@ -76,9 +76,9 @@ def test_a_map_without_poses_on_every_server(open_db: Opening, walk: tuple[Path,
     assert off(db, "walk", truth) < 0.01
 
 
-def test_workers_take_poses_from_the_plan(open_db: Opening, walk: tuple[Path, FloatArray], tmp_path: Path) -> None:
+def test_workers_take_poses_from_the_plan(open_file: Opening, walk: tuple[Path, FloatArray], tmp_path: Path) -> None:
     folder, truth = walk
-    db = open_db()
+    db = open_file()
     sent: list[tuple[int, str, tuple[int, ...]]] = []
     [summary] = db.queue([folder], lambda key, source, frames: sent.append((key, source, tuple(frames))), stride=6)
     assert summary.stored == 0
