@@ -161,7 +161,7 @@ def test_other_models_and_other_plans_are_refused(room: Path, tmp_path: Path) ->
     with pytest.raises(ProvenanceError, match=r"surf.*sift|sift.*surf"):
         ingest_recordings([room], settings(url).model_copy(update={"features": "sift"}), IngestOptions(map_name="m"))
     with pytest.raises(UsageError, match="semdb delete"):
-        ingest_recordings([room], settings(url), IngestOptions(keyframes=4, map_name="m"))
+        ingest_recordings([room], settings(url), IngestOptions(keyframes=2, map_name="m"))
     with open_store(url) as store:
         assert rows_per_table(store)["keyframes"] == 3
 
