@@ -118,7 +118,7 @@ def comparison_lines(found: PoseComparison | str | None) -> list[str]:
         return []
     if isinstance(found, str):
         return [f"{'estimated':<12} {found}"]
-    rows = [("estimated", f"{found.estimated} poses in {found.pieces} pieces; {found.frames} of them are recorded too")]
+    rows = [("estimated", f"{found.estimated} poses, {found.frames} of them recorded too; pieces: {found.pieces}")]
     errors = found.errors
     if errors is not None:
         off, median, most = (measure(value, 4) for value in (errors.rmse_m, errors.median_m, errors.max_m))

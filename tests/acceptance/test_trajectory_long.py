@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,6 +24,7 @@ from semdb.recordings.synthetic.writer import SyntheticSequence
 from semdb.trajectory.result import Trajectory
 from semdb.trajectory.run import find_trajectory
 from semdb.types import Float32Array, FloatArray, ImageArray
+from tests.rooms import COMMAND, render
 
 pytestmark = pytest.mark.long
 
@@ -108,6 +111,22 @@ def test_equal_desks_are_not_taken_for_each_other() -> None:
     wrong, survived, lost = inject(found)
     assert survived == lost == 0
     assert wrong >= len(found.closures()) // 2
+
+
+def test_threads_of_blas_change_nothing(tmp_path: Path) -> None:
+    recording = render(tmp_path / "room", SyntheticOptions(frames=24, width=320, height=240, lap_frames=80))
+    written = []
+    for threads in ("1", "2"):
+        out = tmp_path / f"{threads}.json"
+        subprocess.run(
+            [*COMMAND, "trajectory", str(recording), "--json", str(out)],
+            env=os.environ | {"OPENBLAS_NUM_THREADS": threads, "OMP_NUM_THREADS": threads},
+            capture_output=True,
+            check=True,
+        )
+        told = json.loads(out.read_text())
+        written.append({key: told[key] for key in ("poses", "edges", "drifts", "upright")})
+    assert written[0] == written[1]
 
 
 MEMORY = """
