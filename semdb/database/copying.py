@@ -143,7 +143,10 @@ def _translate(copy: _Copy, connection: Connection, table: Table, row: Mapping[s
 
 def _shared(copy: _Copy, connection: Connection, table: Table, old: int) -> int:
     """The id in the target of a model, camera or category."""
-    [row] = _rows(copy.source, select(table).where(table.c.id == old))
+    found_rows = _rows(copy.source, select(table).where(table.c.id == old))
+    if not found_rows:
+        raise DatabaseError(f"{table.name} {old}, which the map refers to, is missing: restore the database")
+    row = found_rows[0]
     unique = table.c[SHARED[table.name]]
     query = select(table.c.id).where(unique == row[SHARED[table.name]])
     found = connection.execute(query).scalar()

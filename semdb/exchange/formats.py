@@ -45,8 +45,8 @@ def export_map(
 ) -> str:
     """Writes a map in a format; returns a line about what was written.
 
-    One that fails leaves nothing at `out`. Raises UsageError for a format that is none, or where something is at `out`
-    already; NotFoundError for the map; DatabaseError; CodecError for damaged rows.
+    One that fails leaves at `out` what was there: nothing, or an empty folder. Raises UsageError for a format that is
+    none, or where something is at `out` already; NotFoundError for the map; DatabaseError; CodecError for damaged rows.
     """
     if name not in FORMATS:
         raise UsageError(f"there is no format {name!r}; there are {', '.join(FORMATS)}")
@@ -54,17 +54,21 @@ def export_map(
     write = cast(Exporter, getattr(import_module(module), function))
     source = MapSource.of(store, map_name, progress)
     there = os.path.lexists(out)
+    empty = out.is_dir() and not any(out.iterdir())
     try:
         return write(source, out, options or ExportOptions())
     except BaseException:
         if not there:
             _remove(out)
+        elif empty:
+            for made in out.iterdir():
+                _remove(made)
         raise
 
 
 def _remove(made: Path) -> None:
     """A part of a map looks like one."""
-    if made.is_dir():
+    if made.is_dir() and not made.is_symlink():
         shutil.rmtree(made, ignore_errors=True)
     else:
         made.unlink(missing_ok=True)

@@ -44,9 +44,8 @@ def write_kapture(source: MapSource, out: Path, options: ExportOptions) -> str:
             for sensor in (f"camera{device}", f"depth{device}"):
                 trajectories.write(f"{time}, {sensor}, {', '.join(repr(float(value)) for value in numbers)}\n")
             images.write(f"{time}, camera{device}, {name}\n")
-            if stored.depth is not None:
-                depth = decoded(stored, head)[1]
-                assert depth is not None
+            depth = decoded(stored, head)[1] if stored.depth is not None else None
+            if depth is not None:
                 raw = np.nan_to_num(depth, nan=0.0).astype("<f4")
                 depth_name = source.file_name(head, ".depth")
                 (data / depth_name).write_bytes(raw.tobytes())

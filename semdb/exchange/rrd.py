@@ -32,7 +32,11 @@ def write_rrd(source: MapSource, out: Path, options: ExportOptions) -> str:
         raise UsageError("rerun is switched off: the variable RERUN must not be off")
     stream.set_log_time_enabled(False)  # when it was exported
     stream.set_log_tick_enabled(False)
-    stream.save(out)
+    try:
+        stream.save(out)
+    except RuntimeError as error:  # all that rerun says of a folder that takes no files
+        stream.disconnect()
+        raise UsageError(f"{out}: cannot be written: {error}") from error
     try:
         with_depth = _write(rerun, stream, source)
         stream.flush()

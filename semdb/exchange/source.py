@@ -17,6 +17,7 @@ from semdb.recordings.registration import depth_size
 from semdb.types import Float32Array, ImageArray
 
 CHUNK = 32
+NAME_BYTES = 100  # of a folder: file systems take 255, of which a letter may need four
 Progress = Callable[[str, int, int], None]
 
 
@@ -81,7 +82,8 @@ def folder_names(recordings: Iterable[str]) -> dict[str, str]:
     found: dict[str, str] = {}
     taken: set[str] = set()
     for name in recordings:
-        safe = "".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in name).strip(".")[:100]
+        safe = "".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in name).strip(".")
+        safe = safe.encode()[:NAME_BYTES].decode(errors="ignore")
         own, number = safe or "recording", 1
         while own.lower() in taken:
             number += 1

@@ -20,8 +20,9 @@ from sqlalchemy import func, select
 from semdb.database import retry, schema, tables
 from semdb.database.copying import Copied, copy_map
 from semdb.database.engine import make_engine
+from semdb.database.records import MapInfo
 from semdb.database.store import Store, open_store
-from semdb.errors import RecordingError, SchemaError, UsageError
+from semdb.errors import DatabaseError, RecordingError, SchemaError, UsageError
 from semdb.exchange.source import ExportOptions, MapSource, new_folder
 
 MANIFEST, ROWS = "semdb-map.json", "map.sqlite3"
@@ -76,10 +77,11 @@ def import_whole(folder: Path, store: Store, map_name: str | None = None, progre
         raise RecordingError(f"{folder / ROWS}: is not as it was exported (its SHA-256 differs): copy it again")
     with tempfile.TemporaryDirectory(prefix="semdb-import-") as temporary:
         file = _at_head(folder / ROWS, str(manifest["revision"]), Path(temporary))
-        with open_store(f"sqlite:///{file}") as source:
-            [info] = source.maps()
+        with _opened(file, folder / ROWS) as source:
+            info = _only_map(source, file, folder / ROWS)
             name = map_name or info.name
             _check_models(store, name, source)
+            _check_recordings(store, name, source, info.id)
             tell = None if progress is None else lambda done, total: progress(f"importing {name}", done, total)
             done = copy_map(source.engine, info.id, store.engine, name, progress=tell)
     return done
@@ -117,6 +119,45 @@ def _at_head(file: Path, revision: str, temporary: Path) -> Path:
         finally:
             engine.dispose()
     return copy
+
+
+def _opened(file: Path, exported: Path) -> Store:
+    """The rows of an export. Raises RecordingError, which names what was exported and not the copy of it."""
+    try:
+        return open_store(f"sqlite:///{file}")
+    except (DatabaseError, SchemaError) as error:
+        raise RecordingError(f"{exported}: is no map that `semdb export semdb` wrote: {_about(error, file)}") from error
+
+
+def _about(error: Exception, file: Path) -> str:
+    return str(error).replace(f"sqlite:///{file}", ROWS)
+
+
+def _only_map(source: Store, file: Path, exported: Path) -> MapInfo:
+    """The one map of an export. Raises RecordingError."""
+    try:
+        found = source.maps()
+    except DatabaseError as error:
+        raise RecordingError(f"{exported}: cannot be read: {_about(error, file)}") from error
+    if len(found) != 1:
+        raise RecordingError(f"{exported}: holds {len(found)} maps, but an export has one: export it again")
+    return found[0]
+
+
+def _check_recordings(store: Store, name: str, source: Store, map_id: int) -> None:
+    """Raises UsageError where the target's map of that name has what the export has not: poses of another world."""
+    r, m = tables.recordings.c, tables.maps.c
+
+    def of(engine: Any, condition: Any) -> dict[str, str]:
+        query = select(r.name, r.fingerprint).join(tables.maps, m.id == r.map_id).where(condition)
+        return retry.read(engine, lambda connection: {row[0]: row[1] for row in connection.execute(query)})
+
+    own = of(source.engine, m.id == map_id)
+    for recording, fingerprint in of(store.engine, m.name == name).items():
+        if own.get(recording) != fingerprint:
+            raise UsageError(
+                f"the map {name!r} has another recording {recording!r} already: import under another name with --map"
+            )
 
 
 def _check_models(store: Store, name: str, source: Store) -> None:

@@ -226,9 +226,11 @@ def _associate(
         shift = round(options.depth_offset_ms * 1e6)
         partner, gaps = nearest_pairs(times, np.array(depth.stamps, dtype=np.int64) + shift)
         if all(found is None for found in partner):
+            nearest = int(times[np.argmin(gaps)])
+            late = min((nearest - stamp - shift for stamp in depth.stamps), key=abs) + shift
             draft.notes.append(
                 f"no depth image lies within {LIMIT_MS:g} ms of a colour image (the nearest: {gaps.min() / 1e6:.1f} ms)"
-                ": the frames have no depth (--depth-offset-ms for clocks that differ)"
+                f": the frames have no depth (--depth-offset-ms {late / 1e6:.1f} where the clocks differ by that)"
             )
             depth = None
     for index, time_ns in enumerate(color.stamps):

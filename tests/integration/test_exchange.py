@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import json
+import shutil
+import sqlite3
 import sys
 from pathlib import Path
 
@@ -18,7 +22,7 @@ from semdb.errors import RecordingError, SchemaError, UsageError
 from semdb.exchange import ply
 from semdb.exchange.formats import FORMATS, export_map
 from semdb.exchange.ply import voxels
-from semdb.exchange.source import ExportOptions, folder_names
+from semdb.exchange.source import ExportOptions, MapSource, folder_names
 from semdb.exchange.tracks import View, find_tracks, matches
 from semdb.exchange.whole import MANIFEST, ROWS, import_whole
 from semdb.geometry import pose_error, pose_from, project, so3_exp
@@ -252,6 +256,26 @@ def test_what_cannot_be_exported(map_url: str, tmp_path: Path) -> None:
             export_map(store, "tum", "m", tmp_path / "no" / "t.txt")
 
 
+@pytest.mark.parametrize("form", ["colmap", "kapture", "semdb"])
+def test_a_folder_that_was_empty_is_so_again_when_an_export_fails(
+    map_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: str
+) -> None:
+    def stop(self: MapSource, what: str, done: int, total: int | None = None) -> None:
+        assert any(tmp_path.iterdir())
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(MapSource, "tell", stop)
+    with open_store(map_url) as store, pytest.raises(KeyboardInterrupt):
+        export_map(store, form, "m", tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_place_where_rerun_cannot_write_is_named(map_url: str) -> None:
+    pytest.importorskip("rerun")
+    with open_store(map_url) as store, pytest.raises(UsageError, match=r"^/proc/m\.rrd: cannot be written: "):
+        export_map(store, "rrd", "m", Path("/proc/m.rrd"))
+
+
 def rows_of(url: str, name: str) -> dict[str, list[tuple[object, ...]]]:
     """All rows of a map without ids and times, by table."""
     with open_store(url) as store, store.engine.connect() as connection:
@@ -309,6 +333,43 @@ def test_damaged_and_foreign_folders_are_not_imported(map_url: str, tmp_path: Pa
         assert store.maps() == []
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("DELETE FROM maps", "holds 0 maps, but an export has one"),
+        (
+            "DROP TABLE alembic_version",
+            "is no map that `semdb export semdb` wrote: there is no semdb schema in map.sqlite3",
+        ),
+    ],
+)
+def test_exports_with_other_rows_and_their_checksum(map_url: str, tmp_path: Path, change: str, message: str) -> None:
+    with open_store(map_url) as store:
+        export_map(store, "semdb", "m", tmp_path / "out")
+    file, manifest = tmp_path / "out" / ROWS, tmp_path / "out" / MANIFEST
+    with contextlib.closing(sqlite3.connect(file)) as connection, connection:
+        connection.execute(change)
+    said = json.loads(manifest.read_text()) | {"sha256": hashlib.sha256(file.read_bytes()).hexdigest()}
+    manifest.write_text(json.dumps(said))
+    with open_store(f"sqlite:///{tmp_path / 'n.sqlite3'}", create=True) as store:
+        with pytest.raises(RecordingError, match=message) as caught:
+            import_whole(tmp_path / "out", store)
+        assert str(file) in str(caught.value)
+        assert store.maps() == []
+
+
+def test_a_map_of_the_name_with_another_recording_is_not_added_to(map_url: str, room: Path, tmp_path: Path) -> None:
+    with open_store(map_url) as store:
+        export_map(store, "semdb", "m", tmp_path / "out")
+    shutil.copytree(room, tmp_path / "office")
+    url = f"sqlite:///{tmp_path / 'n.sqlite3'}"
+    ingest_recordings([tmp_path / "office"], settings(url), IngestOptions(map_name="m", keyframes=3))
+    with open_store(url) as store:
+        with pytest.raises(UsageError, match="has another recording 'office' already"):
+            import_whole(tmp_path / "out", store)
+        assert [info.keyframes for info in store.maps()] == [3]
+
+
 def test_another_recording_of_the_name_is_not_mixed_in(map_url: str, room: Path, tmp_path: Path) -> None:
     with open_store(map_url) as store:
         export_map(store, "semdb", "m", tmp_path / "out")
@@ -344,6 +405,7 @@ def test_folder_names_are_of_letters_and_all_different() -> None:
         "..": "recording",
         "ä": "ä",
     }
+    assert folder_names(["室" * 100, "室" * 101]) == {"室" * 100: "室" * 33, "室" * 101: "室" * 33 + "-2"}
 
 
 def test_tracks_find_points_again_through_noise_of_depth() -> None:

@@ -214,6 +214,9 @@ def test_a_bag_of_realsense_recorder(shared_dir: Path) -> None:
     recording = open_recording(file)
     assert (recording.camera.fx, recording.camera.width) == (pytest.approx(613.2037), 640)
     assert any("the nearest: 101.6 ms" in note for note in recording.notes)
+    assert any("--depth-offset-ms -101.6 where" in note for note in recording.notes)
+    other = open_recording(file, options=ReadOptions(depth_offset_ms=100))
+    assert any("--depth-offset-ms -101.6 where" in note for note in other.notes)
     together = open_recording(file, options=ReadOptions(depth_offset_ms=-101.6))
     frame = together.read(together.entries[0])
     assert frame.depth is not None
