@@ -20,10 +20,12 @@ from sqlalchemy import func, select
 from semdb.database import retry, schema, tables
 from semdb.database.copying import Copied, copy_map
 from semdb.database.engine import make_engine
+from semdb.database.ids import check_name
 from semdb.database.records import MapInfo
 from semdb.database.store import Store, open_store
 from semdb.errors import DatabaseError, RecordingError, SchemaError, UsageError
 from semdb.exchange.source import ExportOptions, MapSource, new_folder
+from semdb.names import storable
 
 MANIFEST, ROWS = "semdb-map.json", "map.sqlite3"
 FORMAT = "semdb-map"
@@ -79,7 +81,7 @@ def import_whole(folder: Path, store: Store, map_name: str | None = None, progre
         file = _at_head(folder / ROWS, str(manifest["revision"]), Path(temporary))
         with _opened(file, folder / ROWS) as source:
             info = _only_map(source, file, folder / ROWS)
-            name = map_name or info.name
+            name = check_name("map", storable(info.name if map_name is None else map_name))
             _check_models(store, name, source)
             _check_recordings(store, name, source, info.id)
             tell = None if progress is None else lambda done, total: progress(f"importing {name}", done, total)

@@ -378,9 +378,13 @@ def test_another_recording_of_the_name_is_not_mixed_in(map_url: str, room: Path,
     with open_store(url) as store:
         with pytest.raises(UsageError, match=r"has another recording 'room' already: .* with --map"):
             import_whole(tmp_path / "out", store)
+        for name in ("", "a\nb", "x" * 256):
+            with pytest.raises(UsageError, match="cannot be the name of a map"):
+                import_whole(tmp_path / "out", store, name)
+        assert import_whole(tmp_path / "out", store, "caf\\udce9").map == "caf\\udce9"  # as it is written, once
         done = import_whole(tmp_path / "out", store, "other")
         assert (done.map, done.keyframes) == ("other", KEYFRAMES)
-        assert sorted(info.keyframes for info in store.maps()) == [3, KEYFRAMES]
+        assert sorted(info.keyframes for info in store.maps()) == [3, KEYFRAMES, KEYFRAMES]
 
 
 def test_commands(map_url: str, tmp_path: Path) -> None:
