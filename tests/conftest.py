@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NoReturn
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from tests.mariadb import MARIADB
 from tests.mysql import MYSQL
@@ -23,6 +24,9 @@ for _name in [name for name in os.environ if name.startswith("SEMDB_") and not n
     del os.environ[_name]
 os.environ["SEMDB_CHECK_RECORDINGS"] = "false"  # a second for each ingest; tests of the check say otherwise
 signal.signal(signal.SIGINT, signal.default_int_handler)
+# how long examples take says more of the machine's load than of the code
+settings.register_profile("semdb", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("semdb")
 
 
 @pytest.fixture(scope="session")

@@ -103,7 +103,8 @@ def test_commands_on_rows_with_hostile_names() -> None:
     assert put_back.startswith(f"{SHOWN}/{SHOWN}1: 1 put back; run: semdb ingest $'/data/\\x1b[31m")
     assert any(SHOWN in line for line in lines("models", "list"))
     assert sum(SHOWN in line for line in lines("keypoints", "1")) > 3
-    assert all(line.startswith(f"{SHOWN}: ") for line in lines("refine") if line)
+    done = [line for line in lines("refine") if line and not line.startswith("semdb: what is damaged of keyframe ")]
+    assert [line for line in done if not line.startswith(f"{SHOWN}: ")] == []
     assert "there is no map" in lines("delete", "map", HOSTILE + "?", "--yes", code=1)[1]
     assert lines("delete", "recording", HOSTILE + "2", "--yes")[0].startswith(f"deleted the recording {SHOWN}/{SHOWN}2")
     assert lines("delete", "map", HOSTILE, "--yes")[0].startswith(f"deleted the map {SHOWN}")
