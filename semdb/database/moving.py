@@ -81,6 +81,7 @@ def move_within(connection: Connection, wanted: Move, token: str) -> int:
         if one.map_id != wanted.map_id:
             models = map_model_ids(connection, wanted.map_id)
             check_models(models, map_model_ids(connection, one.map_id), f"the map {there!r}")
+    _check_links(connection, wanted)
     operation = _note(connection, wanted, token)
     for one in wanted.recordings:
         _move_recording(connection, one, wanted.map_id)
@@ -151,6 +152,16 @@ def _check_recording(connection: Connection, one: MovedRecording, wanted: Move, 
         raise DatabaseError(
             f"keyframes of {one.name!r} were stored or deleted meanwhile, nothing is changed: run it again"
         )
+
+
+def _check_links(connection: Connection, wanted: Move) -> None:
+    """Raises DatabaseError where a keyframe that a link names is gone."""
+    ends = sorted({key for link in wanted.links for key in (link.first, link.second)})
+    for some in chunks(ends):
+        there = set(connection.execute(select(keyframes.c.id).where(keyframes.c.id.in_(some))).scalars())
+        for key in some:
+            if key not in there:
+                raise DatabaseError(f"keyframe {key} was deleted meanwhile, nothing is changed: run it again")
 
 
 def _done_before(connection: Connection, map_id: int, token: str) -> int | None:

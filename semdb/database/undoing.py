@@ -35,6 +35,7 @@ from semdb.database.tables import (
     pose_covariances,
     pose_operations,
     pose_revisions,
+    pose_sources,
     recordings,
 )
 from semdb.errors import DatabaseError, UsageError
@@ -74,7 +75,8 @@ def _operation(row: Any) -> PoseOperation:
 def undo(engine: Engine, operation: PoseOperation) -> int:
     """Takes an operation back, all or nothing; returns how many keyframes are where they were.
 
-    Raises UsageError where it was taken back already, or its keyframes were moved since, or the name is taken by now.
+    Raises UsageError where it was taken back already, or its keyframes were moved since, or the name is taken by now,
+    or the map that it came from has another frame by now.
     """
     mine: list[bool] = []
     try:
@@ -105,6 +107,8 @@ def _undo(connection: Connection, operation: PoseOperation, mine: list[bool]) ->
     source = None
     if operation.recording_id is not None:
         source = _source_before(operation)
+        if map_id != operation.map_id:
+            _refuse_another_frame(connection, operation, map_id, source)
         poses |= _late(connection, operation, source, poses)
     mine_only = _of_recording(connection, operation, poses)
     put_poses(connection, mine_only, dict.fromkeys(mine_only, operation.map_id), map_id)
@@ -195,6 +199,21 @@ def _map_before(connection: Connection, operation: PoseOperation) -> int:
         made_by = [{"map_id": key, "role": row.role, "model_id": row.model_id} for row in rows]
         connection.execute(insert(map_models), made_by)
     return key
+
+
+def _refuse_another_frame(
+    connection: Connection, operation: PoseOperation, map_id: int, source: RecordingPoses
+) -> None:
+    """Raises UsageError where a recording came into the map meanwhile that has a frame of its own."""
+    r, s = recordings.c, pose_sources.c
+    query = select(r.name, s.world).join(pose_sources, s.recording_id == r.id, isouter=True).where(r.map_id == map_id)
+    for other in connection.execute(query.order_by(r.id)):
+        worlds = {source.world.value, other.world or World.RECORDING.value}
+        if World.FIRST_KEYFRAME.value in worlds and World.ALIGNED.value not in worlds:
+            raise UsageError(
+                f"the map {operation.from_map!r} that the recording came from holds {other.name!r} by now, which has "
+                "another frame: delete that, or leave the recording where it is"
+            )
 
 
 def _recording_back(connection: Connection, operation: PoseOperation, map_id: int, source: RecordingPoses) -> None:

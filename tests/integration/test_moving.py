@@ -209,6 +209,34 @@ def test_the_map_that_a_recording_came_from_is_made_again(store: Store) -> None:
     assert store.map_models(found.id) == MODELS
 
 
+def test_nothing_is_taken_back_into_another_frame(store: Store) -> None:
+    map_id, _, _ = fill(store)
+    source, recording_id, ids = fill_estimated(store)
+    move(store.engine, wanted(store, map_id, recording_id, source))
+    fill(store, "estimated", "second visit")  # the map was empty, so it may have another frame now
+    [noted] = list_operations(store.engine, map_id)
+    before = everything(store)
+    with pytest.raises(
+        UsageError, match=r"the map 'estimated' .* holds 'second visit' by now, which has another frame"
+    ):
+        undo(store.engine, noted)
+    assert everything(store) == before
+    store.delete_recording(next(one.recording_id for one in store.status(source)))
+    assert undo(store.engine, noted) == len(ids)
+    assert store.keyframe_ids(source) == ids
+
+
+def test_a_link_to_a_keyframe_that_is_gone_is_told_as_that(store: Store) -> None:
+    map_id, _, theirs = fill(store)
+    source, recording_id, _ = fill_estimated(store)
+    stale = wanted(store, map_id, recording_id, source)
+    store.delete_keyframes([min(theirs)])
+    before = everything(store)
+    with pytest.raises(DatabaseError, match=f"keyframe {min(theirs)} was deleted meanwhile, nothing is changed"):
+        move(store.engine, stale)
+    assert everything(store) == before
+
+
 def test_what_is_stored_late_goes_along(store: Store) -> None:
     map_id, _, _ = fill(store)
     source, recording_id, ids = fill_estimated(store, leave=2)
