@@ -15,7 +15,10 @@ if TYPE_CHECKING:
     from semdb.api import Database
     from semdb.refinement.align import AlignedKeyframe, AlignReport
 
-COLUMNS = ("keyframe", "frame", "verdict", "agrees", "inliers", "off m", "off deg", "bend m", "bend deg")
+COLUMNS = (
+    *("keyframe", "frame", "verdict", "agrees", "inliers"),
+    *("off m", "off deg", "shift m", "shift deg", "bend m", "bend deg"),
+)
 
 
 @settings_options(models=False)
@@ -95,7 +98,7 @@ def print_keyframes(report: AlignReport) -> None:
 
 def row(one: AlignedKeyframe) -> tuple[Any, ...]:
     """One line of the table."""
-    numbers = (one.off_m, one.off_deg, one.bend_m, one.bend_deg)
+    numbers = (one.off_m, one.off_deg, one.shift_m, one.shift_deg, one.bend_m, one.bend_deg)
     shown = (None if math.isnan(value) else round(value, 4) for value in numbers)
     frame = f"{one.recording}/{one.frame_index}"
     return (one.keyframe, frame, one.verdict, "yes" if one.agrees else "", one.inliers, *shown)
@@ -114,7 +117,8 @@ def as_lines(report: AlignReport, *, dry_run: bool = False) -> list[str]:
     bends = sorted(one.bend_m for one in report.keyframes)
     lines.append(f"bend       {measure(bends[len(bends) // 2], 4)} m median, {measure(bends[-1], 4)} m at most")
     if report.map_shift_m:
-        lines.append(f"map        its keyframes moved by {measure(report.map_shift_m, 4)} m at most")
+        moved = "would move" if dry_run else "moved"
+        lines.append(f"map        its keyframes {moved} by {measure(report.map_shift_m, 4)} m at most")
     if dry_run:
         return [*lines, f"would move from {report.from_map} to {report.map}; nothing is changed"]
     return [*lines, f"moved from {report.from_map} to {report.map}; back again: semdb align --undo"]

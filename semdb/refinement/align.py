@@ -47,8 +47,9 @@ Progress = Callable[[str, int, int], None]
 class AlignedKeyframe:
     """One keyframe: what localizing it in the map gave, and whether that agrees with the others.
 
-    `off_m` and `off_deg`: how far that is from its new pose (NaN where it was not localized); `bend_m` and `bend_deg`:
-    how far its new pose is from where one motion of the whole recording would put it (NaN where nothing convinced).
+    `off_m` and `off_deg`: how far that is from its new pose (NaN where it was not localized); `shift_m` and
+    `shift_deg`: how far its new pose is from the one it has; `bend_m` and `bend_deg`: from where one motion of the
+    whole recording would put it (NaN where nothing convinced).
     """
 
     keyframe: int
@@ -59,6 +60,8 @@ class AlignedKeyframe:
     inliers: int
     off_m: float = math.nan
     off_deg: float = math.nan
+    shift_m: float = math.nan
+    shift_deg: float = math.nan
     bend_m: float = math.nan
     bend_deg: float = math.nan
 
@@ -149,24 +152,25 @@ def align_recordings(
     reason = convinces(consensus, near, same, options)
     placed = None
     if not reason:
-        sources = [recording_poses(store.engine, one.recording_id).source for one in recordings]
-        estimated = PoseSource.ESTIMATED in sources
         links = list_links(store.engine, recordings[0].map_id, bad=store.left_out)
         map_links = list_links(store.engine, target.id, bad=store.left_out) if joint else []
         placed = place(
             consensus,
             theirs.poses,
             mine.poses,
-            mine.links(links, options.drift if estimated else options.recorded),
-            theirs.links(map_links, options.recorded) if joint else None,
+            mine.links(links, _stiffness(store, recordings, options)),
+            theirs.links(map_links, _stiffness(store, store.status(target.id), options)) if joint else None,
             options,
         )
     report = _report(recordings, target, consensus, (near, same), reason, mine, answers, placed)
-    if placed is None or dry_run:
+    if placed is None:
+        return report
+    shift = [pose_error(a, b)[0] for a, b in zip(placed.map_poses, theirs.poses, strict=True)]
+    report = replace(report, map_shift_m=max(shift, default=0.0))
+    if dry_run:
         return report
     wanted = _move(recordings, names, target, mine, theirs, consensus, placed, report, joint=joint)
-    shift = [pose_error(a, b)[0] for a, b in zip(placed.map_poses, theirs.poses, strict=True)]
-    return replace(report, operation=move(store.engine, wanted), map_shift_m=max(shift, default=0.0))
+    return replace(report, operation=move(store.engine, wanted))
 
 
 def _check(store: Store, recordings: Sequence[RecordingStatus], target: MapInfo, name: str | None) -> dict[int, str]:
@@ -190,6 +194,12 @@ def _check(store: Store, recordings: Sequence[RecordingStatus], target: MapInfo,
             )
     check_models(store.map_models(target.id), store.map_models(recordings[0].map_id), f"the map {target.name!r}")
     return names
+
+
+def _stiffness(store: Store, recordings: Sequence[RecordingStatus], options: SessionOptions) -> StepNoise:
+    """How far their poses may be off from keyframe to keyframe."""
+    sources = [recording_poses(store.engine, one.recording_id).source for one in recordings]
+    return options.drift if PoseSource.ESTIMATED in sources else options.recorded
 
 
 def _localized(
@@ -296,15 +306,16 @@ def _report(
     for number, head in enumerate(mine.heads):
         answer = answers.get(head.id)
         verdict = "damaged" if answer is None else answer.verdict.value
-        off = bend = math.nan, math.nan
+        off = shift = bend = math.nan, math.nan
         if placed is not None and consensus.map_from_recording is not None:
+            shift = pose_error(placed.poses[number], mine.poses[number])
             bend = pose_error(placed.poses[number], consensus.map_from_recording @ mine.poses[number])
             if answer is not None and answer.world_from_camera is not None:
                 off = pose_error(answer.world_from_camera, placed.poses[number])
         inliers = 0 if answer is None else answer.inliers
         keyframes.append(
             AlignedKeyframe(
-                head.id, head.recording, head.frame_index, verdict, number in agreeing, inliers, *off, *bend
+                head.id, head.recording, head.frame_index, verdict, number in agreeing, inliers, *off, *shift, *bend
             )
         )
     return AlignReport(

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import sqlite3
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -128,6 +130,13 @@ def test_the_command(filled: str, tmp_path: Path) -> None:
     assert dry.returncode == 0, dry.stderr
     assert dry.stdout.count("second/") == 10
     assert "would move from own to room; nothing is changed" in dry.stdout
+    assert "shift m" in dry.stdout
+    tried = semdb("align", "second", "--map", "room", "--dry-run", "--joint", "--json", url=url)
+    shown = json.loads(tried.stdout)
+    assert (shown["convinced"], shown["moved"]) == (True, False)
+    assert 0 < shown["map_shift_m"] < 0.005
+    apart = [one["shift_m"] for one in shown["keyframes"]]  # MOTION, of this recording
+    assert np.median(apart) > 0.5
     refused = semdb("align", "alike", "--map", "room", url=url)
     assert refused.returncode == 1
     assert "not moved: " in refused.stdout
@@ -159,6 +168,16 @@ def test_maps_are_merged_and_the_map_may_move_too(db: Database) -> None:
     assert np.median(errors(db, "room", "second", invert_pose(MOTION), before)[:, 0]) < 0.003
     db.undo_align(map="room")
     assert len(poses(db, "own", "second")) == 10
+
+
+def test_an_estimated_map_bends_more_than_a_recorded_one(db: Database, tmp_path: Path) -> None:
+    recorded = db.align("second", map="room", joint=True, dry_run=True)
+    with closing(sqlite3.connect(tmp_path / "semdb.sqlite3")) as file, file:
+        file.execute("UPDATE pose_sources SET pose_source = 'estimated'")
+    estimated = db.align("second", map="room", joint=True, dry_run=True)
+    assert recorded.convinced
+    assert estimated.convinced
+    assert estimated.map_shift_m > 2 * recorded.map_shift_m > 0
 
 
 def test_what_cannot_be_aligned(db: Database) -> None:
