@@ -36,8 +36,11 @@ def write_g2o(source: MapSource, out: Path, options: ExportOptions) -> str:
         for link in edges:
             file.write(f"EDGE_SE3:QUAT {link.first} {link.second} {_pose(link.first_from_second)} {_upper(link)}\n")
     left = len(links) - len(edges)
-    return f"{len(source.heads)} vertices, {len(edges)} edges" + (
-        f"; {left} that do not count left out" if left else ""
+    loose = len(known - {key for link in edges for key in (link.first, link.second)})
+    return (
+        f"{len(source.heads)} vertices, {len(edges)} edges"
+        + (f"; {left} that do not count left out" if left else "")
+        + (f"; {loose} vertices without an edge" if loose else "")
     )
 
 

@@ -1,4 +1,4 @@
-"""`semdb loops` and `semdb export g2o`, read back by a reader of its own."""
+"""`semdb loops` and `semdb export g2o`, read back by its own reader and by a public one."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from graphslam.graph import Graph
 from typer.testing import CliRunner
 
 from semdb.cli.main import app
@@ -99,7 +100,17 @@ def test_a_pose_graph_is_read_back(store: Store, tmp_path: Path) -> None:
         turn = np.array([0.0, 0, 0, 0.01, 0, 0])
         half = np.array([0.0, 0, 0, np.sin(0.005), 0, 0])
         assert half @ matrix @ half == pytest.approx(turn @ link.information @ turn, rel=1e-4)
+    public = Graph.from_g2o(str(out))
+    assert [(one.vertex_ids, one.vertices[0].id) for one in public._edges] == [([a, b], a) for a, b, _, _ in edges]
+    for vertex in public._vertices:
+        *position, x, y, z, w = vertex.pose.to_array()
+        read = pose_from(rotation_from_quat_wxyz([w, x, y, z]), position)
+        np.testing.assert_allclose(read, stored[vertex.id], atol=1e-12)
+    for edge, (_, _, _, matrix) in zip(public._edges, edges, strict=True):
+        np.testing.assert_allclose(edge.information, matrix, rtol=1e-12)
     with pytest.raises(UsageError, match="is there already"):
         export_map(store, "g2o", "estimated", out)
     fill(store)
-    assert export_map(store, "g2o", "room", tmp_path / "room.g2o") == "5 vertices, 0 edges"
+    assert export_map(store, "g2o", "room", tmp_path / "room.g2o") == (
+        "5 vertices, 0 edges; 5 vertices without an edge"
+    )
