@@ -13,6 +13,7 @@ from semdb.geometry import back_project, transform_points
 from semdb.types import BoolArray, Camera, Float32Array, FloatArray, ImageArray
 
 VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
+SMALLEST_M = 0.001  # of a voxel: 21 bits an axis reach a kilometre then
 LATE = 50_000  # numbers at least before they are sorted in among all
 EDGES = np.array(
     [[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]], np.int64
@@ -25,8 +26,10 @@ def write_ply(source: MapSource, out: Path, options: ExportOptions) -> str:
 
     Raises UsageError where no keyframe has depth.
     """
-    if options.voxel_m <= 0:
-        raise UsageError(f"--voxel must be positive, but is {options.voxel_m:g}")
+    if not SMALLEST_M <= options.voxel_m < np.inf:
+        raise UsageError(f"--voxel must be {SMALLEST_M:g} metres or more, but is {options.voxel_m:g}")
+    if not options.max_depth_m > 0:
+        raise UsageError(f"--max-depth must be positive, but is {options.max_depth_m:g}")
     seen = _Seen()
     count = without = 0
     with new_file(out).open("wb") as file:

@@ -252,6 +252,15 @@ def test_what_cannot_be_exported(map_url: str, tmp_path: Path) -> None:
             with pytest.raises(UsageError, match="is there already"):
                 export_map(store, form, "m", tmp_path / form)
             assert [file.name for file in (tmp_path / form).iterdir()] == ["mine"]
+        for wrong in (
+            {"voxel_m": np.nan},
+            {"voxel_m": 0.0},
+            {"voxel_m": 1e-9},
+            {"max_depth_m": np.nan},
+            {"max_depth_m": -1.0},
+        ):
+            with pytest.raises(UsageError, match=r"--voxel must be 0\.001 metres or more|--max-depth must be positive"):
+                export_map(store, "ply", "m", tmp_path / "m.ply", ExportOptions(**wrong))
         with pytest.raises(UsageError, match="there is no such folder"):
             export_map(store, "tum", "m", tmp_path / "no" / "t.txt")
 
