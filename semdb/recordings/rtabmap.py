@@ -34,6 +34,7 @@ from semdb.recordings.rvl import decode_rvl
 from semdb.types import Camera, Float32Array, FloatArray
 
 TABLES = {"Node", "Data", "Admin", "Link"}
+BEGINNING = 1 << 16  # bytes, in which the statements that made the tables stand
 OLDEST = (0, 11, 10)  # since when images lie in Data as they do now
 RVL = b"DEPTHRVL"
 MILLIMETRES = 1000.0
@@ -49,7 +50,7 @@ class _Place:
 
 
 def is_rtabmap(path: Path) -> bool:
-    """Whether a file is a database of RTAB-Map."""
+    """Whether a file is a database of RTAB-Map, or was one before it was damaged."""
     if not path.is_file() or path.suffix.lower() != ".db":
         return False
     try:
@@ -58,9 +59,21 @@ def is_rtabmap(path: Path) -> bool:
             rows = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
         finally:
             connection.close()
+    except sqlite3.DatabaseError:
+        return _was_rtabmap(path)
     except (sqlite3.Error, OSError):
         return False
     return {str(row[0]) for row in rows} >= TABLES
+
+
+def _was_rtabmap(path: Path) -> bool:
+    """Whether a file that SQLite refuses begins as RTAB-Map's do."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(BEGINNING)
+    except OSError:
+        return False
+    return start.startswith(b"SQLite format 3\0") and all(f"TABLE {name}".encode() in start for name in TABLES)
 
 
 def open_rtabmap(path: Path, camera: Camera | None = None, options: ReadOptions | None = None) -> Recording:

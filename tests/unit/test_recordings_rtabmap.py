@@ -121,6 +121,13 @@ def test_a_damaged_image_is_a_frame_that_cannot_be_decoded(tmp_path: Path) -> No
     assert "is no depth image" in reasons[2]
 
 
+def test_a_database_of_a_user_that_is_cut_off_is_still_one(shared_dir: Path, tmp_path: Path) -> None:
+    whole = (shared_dir / "peers" / "rtabmap" / "rtab_henry.db").read_bytes()
+    (tmp_path / "cut.db").write_bytes(whole[:215_000])
+    with pytest.raises(RecordingError, match=r"cut\.db: cannot be read as a database of RTAB-Map: "):
+        open_recording(tmp_path / "cut.db")
+
+
 def test_a_database_of_a_user(shared_dir: Path) -> None:
     recording = open_recording(shared_dir / "peers" / "rtabmap" / "rtab_henry.db")
     assert recording.contents == (
