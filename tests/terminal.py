@@ -33,19 +33,24 @@ class Terminal:
             os.execvpe(command[0], list(command), variables)
         self.raw = ""
         self._waited = False
+        self._gone = False  # the program
 
     @property
     def seen(self) -> str:
         """All that came, without colours and cursor movements."""
         return ESCAPES.sub("", self.raw)
 
-    def type(self, text: str, until: str) -> str:
-        """Types and reads until `until` is seen. Returns what came since."""
+    def type(self, text: str, until: str, again_s: float = LONGEST_WAIT_S) -> str:
+        """Types and reads until `until` is seen; types it once more after `again_s`. Returns what came since."""
         before = len(self.seen)
         os.write(self.terminal, text.encode())
-        deadline = time.monotonic() + LONGEST_WAIT_S
+        deadline, again = time.monotonic() + LONGEST_WAIT_S, time.monotonic() + again_s
         while until not in self.seen[before:]:
-            if not self._read(deadline - time.monotonic()):
+            if time.monotonic() > again:
+                os.write(self.terminal, text.encode())
+                again = deadline
+            found = self._read(min(deadline, again + 0.1) - time.monotonic())
+            if not found and (self._gone or time.monotonic() >= deadline):
                 raise AssertionError(f"{until!r} did not come: {self.seen[before:]!r}")
         return self.seen[before:]
 
@@ -63,8 +68,9 @@ class Terminal:
             return False
         try:
             data = os.read(self.terminal, 4096)
-        except OSError:  # the program is gone
-            return False
+        except OSError:
+            data = b""
+        self._gone = not data
         self.raw += data.decode(errors="replace")
         return bool(data)
 

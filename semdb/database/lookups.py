@@ -102,7 +102,13 @@ def map_cameras(engine: Engine, map_id: int, say: Callable[[str], None] | None =
 
 def used_cameras(engine: Engine, map_id: int) -> list[UsedCamera]:
     """The cameras of a map's recordings, each with every recording that it took. One that is none is left out."""
-    used = select(keyframes.c.recording_id, keyframes.c.camera_id).distinct().subquery()
+    used = (
+        select(keyframes.c.recording_id, keyframes.c.camera_id)
+        .join(recordings, recordings.c.id == keyframes.c.recording_id)
+        .where(recordings.c.map_id == map_id)
+        .distinct()
+        .subquery()
+    )
     query = (
         select(maps.c.name.label("map_name"), recordings.c.name.label("recording_name"), *_camera_columns())
         .join(recordings, recordings.c.map_id == maps.c.id)

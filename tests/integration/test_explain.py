@@ -130,6 +130,7 @@ def _values(store: Store, map_ids: list[int]) -> dict[str, Any]:
         "write_keyframe.record": record(FRAMES + 3, description(10, ["chair", "cup"])),
         "frame_index": FRAMES + 5,
         "error": "made up",
+        "state": "made up",
         "counts": COUNTS,
         "query": store.class_query(map_ids[0], COUNTS),
         "at_most": 20,

@@ -8,6 +8,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 from sqlalchemy import Connection, Engine, text
@@ -38,12 +39,24 @@ def short_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(retry, "ATTEMPTS", 3)
 
 
+def is_stopped(stat: Path) -> bool:
+    return stat.read_text().rpartition(") ")[2].startswith("T")
+
+
 @pytest.fixture
 def hang(two_servers: list[servers.Server]) -> Iterator[Callable[[], None]]:
     """Stops the first server; it goes on in the end."""
     process = two_servers[0].process
     assert process is not None
-    yield lambda: os.kill(process.pid, signal.SIGSTOP)
+
+    def stop() -> None:
+        os.kill(process.pid, signal.SIGSTOP)
+        threads = Path(f"/proc/{process.pid}/task")
+        deadline = time.monotonic() + 10
+        while any(not is_stopped(thread / "stat") for thread in threads.iterdir()) and time.monotonic() < deadline:
+            time.sleep(0.01)  # one that still runs may answer
+
+    yield stop
     os.kill(process.pid, signal.SIGCONT)
 
 

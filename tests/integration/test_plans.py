@@ -22,6 +22,7 @@ from semdb.ingestion.run import IngestOptions, IngestSummary, ingest_recordings
 from semdb.recordings import open_recording
 from semdb.settings import Settings
 from tests.integration.comparison import content
+from tests.integration.test_faults import make_schema
 from tests.integration.test_queue import Outbox
 
 FEW, MORE = 4, 7
@@ -98,6 +99,7 @@ def test_a_plan_that_failed_or_lacks_deleted_keyframes_grows(room: Path, tmp_pat
 
 
 def test_two_processes_densify_at_once(room: Path, any_server_url: str) -> None:
+    make_schema(any_server_url)
     ingest(room, any_server_url, keyframes=2)
     results: list[IngestSummary] = []
     threads = [

@@ -131,7 +131,7 @@ def test_status_counts_what_is_stored(store: Store) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"fingerprint": "0" * 64}, "which frames can be used"),
+        ({"fingerprint": "0" * 64}, "which keyframes it has, its camera, or their times or poses are others"),
         ({"format": "icl_nuim"}, "its format is tum, not icl_nuim"),
         ({"frame_count": 99}, "number of frames is 100, not 99"),
         ({"frame_indexes": (0, 3, 7, 12, 21)}, "only then: 20; only now: 21"),

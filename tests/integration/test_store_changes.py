@@ -187,7 +187,7 @@ def test_missing_keypoints_are_an_error_not_an_empty_keyframe(store: Store) -> N
     _, _, ids = fill(store)
     with store.engine.begin() as connection:
         connection.execute(delete(tables.descriptors).where(tables.descriptors.c.keyframe_id == ids[0]))
-    with pytest.raises(CodecError, match=f"keyframe {ids[0]} has no"):
+    with pytest.raises(CodecError, match=f"descriptors has no row of keyframe {ids[0]}"):
         store.load_keyframes(ids)
 
 

@@ -232,7 +232,8 @@ def test_the_prompt_on_a_terminal() -> None:
         time.sleep(1.5)  # until the statement runs, and not the reading of its line
         assert "semdb: interrupted" in terminal.type("\x03", "semdb> ")
         terminal.type("SELECT 'half", "half")
-        terminal.type("\x03", "semdb> ")  # Ctrl-C leaves a line, not the prompt
+        # Ctrl-C leaves a line, not the prompt; one that the system hands to another thread waits for the next key
+        terminal.type("\x03", "semdb> ", again_s=10)
         assert terminal.end("\x04") == 0
     history = Path(".local/state/semdb/sql_history")
     assert "SELECT COUNT(*) AS n" in history.read_text()
