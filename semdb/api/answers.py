@@ -88,15 +88,13 @@ class StoredContent:
 
     def depth(self, keyframe_id: int, camera: Camera) -> Float32Array | None:
         """Metres ``[H, W]``, registered to the image of `camera`; None without. Raises NotFoundError, FrameError."""
-        from semdb.recordings.images import decode_depth
-        from semdb.recordings.registration import depth_size, register_depth
+        from semdb.recordings.registration import decode_registered_depth
 
         stored = self._store().load_image(keyframe_id)
         if stored.depth is None or stored.depth_scale is None:
             return None
-        size = depth_size(camera, stored.depth_registration)
-        depth = decode_depth(stored.depth, f"depth of keyframe {keyframe_id}", stored.depth_scale, size)
-        return register_depth(depth, stored.depth_registration, camera)
+        name = f"depth of keyframe {keyframe_id}"
+        return decode_registered_depth(stored.depth, name, stored.depth_scale, stored.depth_registration, camera)
 
     def objects(self, keyframe_id: int) -> tuple[SeenObject, ...]:
         """What was seen, by ordinal. Raises NotFoundError, CodecError."""

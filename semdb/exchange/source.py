@@ -12,8 +12,8 @@ import numpy as np
 from semdb.database.records import KeyframeHead, StoredImage, StoredKeyframe
 from semdb.database.store import Store
 from semdb.errors import UsageError
-from semdb.recordings import decode_color, decode_depth, register_depth
-from semdb.recordings.registration import depth_size
+from semdb.recordings import decode_color
+from semdb.recordings.registration import decode_registered_depth
 from semdb.types import Float32Array, ImageArray
 
 CHUNK = 32
@@ -72,9 +72,8 @@ def decoded(image: StoredImage, head: KeyframeHead) -> tuple[ImageArray, Float32
     pixels = decode_color(image.rgb, name)
     if image.depth is None or image.depth_scale is None:
         return pixels, None
-    size = depth_size(head.camera, image.depth_registration)
-    depth = decode_depth(image.depth, name, image.depth_scale, size)
-    return pixels, register_depth(depth, image.depth_registration, head.camera)
+    scale, registration = image.depth_scale, image.depth_registration
+    return pixels, decode_registered_depth(image.depth, name, scale, registration, head.camera)
 
 
 def folder_names(recordings: Iterable[str]) -> dict[str, str]:

@@ -15,7 +15,6 @@ from semdb.files import only_below, places
 from semdb.recordings.images import (
     decode_16bit,
     decode_color,
-    decode_depth,
     encode_16bit,
     encode_color,
     read_bytes,
@@ -24,7 +23,7 @@ from semdb.recordings.images import (
     scaled_depth,
 )
 from semdb.recordings.options import AS_THE_FORMAT_SAYS, ReadOptions
-from semdb.recordings.registration import depth_size, register_depth
+from semdb.recordings.registration import decode_registered_depth
 from semdb.types import Camera, Float32Array, FloatArray, Frame, ImageArray, InstanceMasks
 
 
@@ -228,9 +227,8 @@ class Recording:
         if self.data is None:
             with only_below(self.below):
                 data = read_bytes(entry.depth_path)
-            size = depth_size(camera, self.depth_registration)
-            depth = decode_depth(data, str(entry.depth_path), self.depth_scale, size)
-            return register_depth(depth, self.depth_registration, camera), data, self.depth_scale
+            name, scale = str(entry.depth_path), self.depth_scale
+            return decode_registered_depth(data, name, scale, self.depth_registration, camera), data, scale
         with only_below(self.below):
             raw = self.data.depth(entry)
         if raw is None:

@@ -20,6 +20,7 @@ import numpy as np
 from semdb.errors import FrameError
 from semdb.geometry import back_project, invert_pose, normalized_to_pixels, pose_from, project_to_so3
 from semdb.recordings.cameras import SEVEN_SCENES_DEPTH
+from semdb.recordings.images import decode_depth
 from semdb.types import Camera, Float32Array, FloatArray
 
 REGISTRATION_7SCENES = "7scenes"
@@ -66,6 +67,17 @@ def register_depth(depth: Float32Array, registration: str, camera: Camera) -> Fl
         known = ", ".join(map(repr, ("", *REGISTRATIONS)))
         raise FrameError(f"unknown depth registration {registration!r}; known are {known}")
     return REGISTRATIONS[registration].register(depth, camera)
+
+
+def decode_registered_depth(
+    data: bytes, name: str, depth_scale: float, registration: str, camera: Camera
+) -> Float32Array:
+    """Depth ``[H, W]`` metres (NaN invalid) of a file as recorded, registered to the colour `camera`.
+
+    Raises FrameError naming `name`, also for a file of another size than the one that `registration` takes.
+    """
+    depth = decode_depth(data, name, depth_scale, depth_size(camera, registration))
+    return register_depth(depth, registration, camera)
 
 
 def register_seven_scenes(depth: Float32Array, camera: Camera) -> Float32Array:

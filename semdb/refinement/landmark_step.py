@@ -121,16 +121,13 @@ def _confusion(placed: Any, names: Sequence[str]) -> FloatArray:
 
 def depth_of(row: KeyframeDepth) -> Float32Array | None:
     """Depth ``[H, W]`` in metres, registered to colour; None without. Raises CodecError for a damaged file."""
-    from semdb.recordings.images import decode_depth
-    from semdb.recordings.registration import depth_size, register_depth
+    from semdb.recordings.registration import decode_registered_depth
 
     if row.depth is None or row.depth_scale is None:
         return None
     name = f"keyframe_images.depth of keyframe {row.id}"
     try:
-        size = depth_size(row.camera, row.depth_registration)
-        depth = decode_depth(row.depth, name, row.depth_scale, size)
-        return register_depth(depth, row.depth_registration, row.camera)
+        return decode_registered_depth(row.depth, name, row.depth_scale, row.depth_registration, row.camera)
     except FrameError as error:
         raise CodecError(str(error)) from None
 
