@@ -19,7 +19,7 @@ from semdb.errors import CodecError, FrameError, NotFoundError
 from semdb.geometry import POSE_UNIT_M, pose_distances
 from semdb.geometry.sensor import depth_noise
 from semdb.localization.coarse import MapChange
-from semdb.localization.surface_alignment import PlacedSurfaces, place
+from semdb.localization.surface_alignment import PlacedSurfaces
 from semdb.localization.surface_cache import SurfaceCache
 from semdb.localization.views import ClassNumbers, KeyframeView, make_keyframe_view
 from semdb.recordings.images import decode_color_grey, has_size
@@ -188,9 +188,9 @@ class KeyframeCache:
             ids, poses = self.near(pose, FAR_SURFACES, (), 2 * count)
             placed: list[PlacedSurfaces] = []
             for keyframe_id, world_from_camera in zip(ids, poses, strict=True):
-                surfaces = self._surfaces.of(keyframe_id)
+                surfaces = self._surfaces.placed(keyframe_id, world_from_camera)
                 if surfaces is not None:
-                    placed.append(place(keyframe_id, surfaces, world_from_camera))
+                    placed.append(surfaces)
                 if len(placed) == count:
                     break
             return placed

@@ -20,7 +20,6 @@ from semdb.types import FloatArray
 
 LONGEST_STEP = 0.1  # metres and radians together
 STILL = 2e-5
-_GREY = slice(7, 13)  # of what is counted, as in surface_kernels
 SAME_M, SAME_DEG = 0.03, 1.5  # poses nearer than this are one
 
 
@@ -51,6 +50,7 @@ class PlacedSurfaces:
     """Surfaces of a keyframe in the world: points and normals ``[n, 3]`` of each level."""
 
     keyframe_id: int
+    world_from_camera: FloatArray
     surfaces: Surfaces
     points: tuple[FloatArray, ...]
     normals: tuple[FloatArray, ...]
@@ -86,6 +86,7 @@ def place(keyframe_id: int, surfaces: Surfaces, world_from_camera: FloatArray) -
     turn = world_from_camera[:3, :3].T
     return PlacedSurfaces(
         keyframe_id,
+        world_from_camera,
         surfaces,
         tuple(transform_points(world_from_camera, level.points) for level in surfaces),
         tuple(np.ascontiguousarray(level.normals @ turn) for level in surfaces),
@@ -113,7 +114,7 @@ def fit_surfaces(
             damping = 1e-6 * float(np.trace(matrix)) / 6 + 1e-6
             step = -np.linalg.solve(matrix + damping * np.eye(6), gradient)
             size = float(np.linalg.norm(step))
-            pose = _moved(pose, step * min(1.0, LONGEST_STEP / max(size, 1e-12)))
+            pose = moved(pose, step * min(1.0, LONGEST_STEP / max(size, 1e-12)))
             tones = _tones(counts, tones)
             if size < STILL:
                 break
@@ -169,9 +170,16 @@ def _linearise(
     return np.triu(matrix) + np.triu(matrix, 1).T, gradient, counts
 
 
+def _grey_sums(counts: FloatArray) -> FloatArray:
+    """Weight, k, q, kk, qk and qq ``[6, n]`` of what was counted of each keyframe."""
+    from semdb.localization.surface_kernels import DETAIL_FIRST, GREY_FIRST
+
+    return counts[:, GREY_FIRST:DETAIL_FIRST].T
+
+
 def _tones(counts: FloatArray, known: FloatArray) -> FloatArray:
     """Gain and bias ``[k, 2]`` from a keyframe's grey values to the query's; `known` where few are seen."""
-    weight, k, q, kk, qk, _ = counts[:, _GREY].T
+    weight, k, q, kk, qk, _ = _grey_sums(counts)
     safe = np.maximum(weight, 1.0)
     variance, covariance = kk / safe - (k / safe) ** 2, qk / safe - k * q / safe**2
     gain = np.clip(covariance / np.maximum(variance, 1e-6), 0.5, 2.0)
@@ -218,14 +226,16 @@ def _scatter(matrices: FloatArray, gradients: FloatArray) -> FloatArray:
 
 def _correlation(counts: FloatArray) -> float:
     """Of the grey values of all keyframes with the query's, each about its own mean."""
-    weight, k, q, kk, qk, qq = counts[counts[:, _GREY.start] > 50][:, _GREY].T
+    sums = _grey_sums(counts)
+    weight, k, q, kk, qk, qq = sums[:, sums[0] > 50]
     own, theirs = (kk - k * k / weight).sum(), (qq - q * q / weight).sum()
     both = (qk - q * k / weight).sum()
     return float(both / np.sqrt(max(float(own * theirs), 1e-9)))
 
 
-def _moved(pose: FloatArray, step: npt.NDArray[np.floating[Any]]) -> FloatArray:
-    moved = pose.copy()
-    moved[:3, :3] = so3_exp(step[3:]) @ pose[:3, :3]
-    moved[:3, 3] += step[:3]
-    return moved
+def moved(pose: FloatArray, step: npt.NDArray[np.floating[Any]]) -> FloatArray:
+    """`pose` after a step ``[6]`` in the world: translation, and a rotation (left perturbation) about the camera."""
+    result = pose.copy()
+    result[:3, :3] = so3_exp(step[3:]) @ pose[:3, :3]
+    result[:3, 3] += step[:3]
+    return result

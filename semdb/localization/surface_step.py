@@ -11,13 +11,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from semdb.geometry import invert_pose, pose_error, so3_exp, so3_log
+from semdb.geometry import invert_pose, pose_error, so3_log
 from semdb.localization.confidence import Evidence, confidence_of, sigmas
 from semdb.localization.matching import Matches
 from semdb.localization.pairs import join_pairs, reprojection_px, world_points_of
 from semdb.localization.pose import FirstPose, FirstSupport, PoseEstimate, estimate_pose, image_spread
 from semdb.localization.pose_options import PoseOptions
-from semdb.localization.surface_alignment import SurfaceFit, SurfaceOptions
+from semdb.localization.surface_alignment import SurfaceFit, SurfaceOptions, moved
 from semdb.localization.verdict import Judgement
 from semdb.localization.views import KeyframeView, View
 from semdb.types import FloatArray, Verdict
@@ -217,10 +217,7 @@ def fused(
     covariance = np.linalg.inv(one + two)
     offset = np.concatenate([other[:3, 3] - laid[:3, 3], so3_log(other[:3, :3] @ laid[:3, :3].T)])
     step = covariance @ two @ offset
-    pose = laid.copy()
-    pose[:3, :3] = so3_exp(step[3:]) @ laid[:3, :3]
-    pose[:3, 3] += step[:3]
-    return pose, covariance
+    return moved(laid, step), covariance
 
 
 def _doubts(
