@@ -77,6 +77,9 @@ class Settings(BaseSettings):
         "auto", description="auto, onnx:FILE, torchvision:NAME or gist. auto: a query takes the map's own"
     )
     features: str = Field("auto", description="auto, surf, sift or orb. auto: the map's own, or surf")
+    words: str | None = Field(
+        None, description="onnx:FILE: a sentence network for words that `semdb find` does not know; default: none"
+    )
     device: str = Field(
         "auto",
         pattern=r"^(auto|cpu|mps|cuda(:\d+)?)$",

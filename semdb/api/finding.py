@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from semdb.database.landmark_search import Wanted
     from semdb.database.records import MapHead
     from semdb.database.store import Store
-    from semdb.landmarks.words import Understood
+    from semdb.landmarks.words import Understood, Vectors
 
 MOST_HITS = 1000
 NEVER_SEEN, GONE, NOT_LOOKED_AT = "never_seen", "gone", "not_looked_at"
@@ -38,8 +38,9 @@ def find(
     seen_after: str | int | datetime | None = None,
     origin: Sequence[float] | None = None,
     limit: int = 10,
+    vectors: Callable[[], Vectors | None] = lambda: None,
 ) -> Found:
-    """Landmarks that are what was asked for: see `semdb.api.reading.Reading.find`."""
+    """Landmarks that are what was asked for: see `semdb.api.reading.Reading.find`. `vectors` makes those of words."""
     from semdb.database import landmark_search as rows
     from semdb.landmarks.words import understand
 
@@ -47,7 +48,7 @@ def find(
         raise UsageError(f"limit is between 1 and {MOST_HITS}, not {limit}")
     known = rows.known_classes(store.engine)
     asked = {"what": what, "near": near, "on": on, "not_near": not_near}
-    meant = {name: understand(word, known) for name, word in asked.items() if word is not None}
+    meant = {name: understand(word, known, vectors) for name, word in asked.items() if word is not None}
     info = None if map is None else _map(store, map)
     after_ns, seen_in = _seen_after(store, seen_after, None if info is None else info.id)
     wanted = rows.Wanted(
@@ -64,9 +65,7 @@ def find(
     found = rows.search(store.engine, wanted)
     evidence = rows.sightings_of(store.engine, [row.landmark_id for row in found]) if found else {}
     hits = tuple(_hit(row, evidence.get(int(row.landmark_id), []), wanted) for row in found)
-    understood: dict[str, Mapping[str, Any]] = {
-        name: {"said": item.said, "classes": list(item.classes), "how": item.how} for name, item in meant.items()
-    }
+    understood: dict[str, Mapping[str, Any]] = {name: item.as_dict() for name, item in meant.items()}
     missing = None if hits else _missing(store, wanted, meant)
     return Found(understood, hits, missing, partial(rows.as_text, store.engine, wanted))
 
@@ -237,7 +236,8 @@ def lines_of(found: Found) -> list[str]:
     for part, item in found.understood.items():
         classes = ", ".join(item["classes"])
         if item["how"] != "class" or part != "what":
-            lines.append(f"{part}: {for_terminal(str(item['said']))} = {for_terminal(classes)}")
+            like = f" (like {item['like']}, {item['cosine']:.2f})" if "like" in item else ""
+            lines.append(for_terminal(f"{part}: {item['said']} = {classes}{like}"))
     for hit in found.hits:
         x, y, z = hit.position
         away = "" if hit.distance is None else f", {hit.distance:.2f} m away"

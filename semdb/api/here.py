@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Protocol
 from weakref import WeakSet
@@ -16,8 +16,12 @@ from semdb.settings import Settings
 
 if TYPE_CHECKING:
     from semdb.ingestion.run import Describers
+    from semdb.landmarks.words import Vectors
     from semdb.localization.on_disk import RecordingsOnDisk
     from semdb.localization.open_maps import OpenMaps
+    from semdb.types import Float32Array
+
+MOST_WORDS = 10_000  # of which vectors are kept
 
 
 class Here:
@@ -31,6 +35,7 @@ class Here:
         self._maps: OpenMaps | None = None
         self._on_disk: RecordingsOnDisk | None = None
         self._describers: Describers = {}
+        self._words: Vectors | None = None
         self._closed = False
 
     def anew(self) -> Here:
@@ -71,6 +76,17 @@ class Here:
                 self._on_disk = RecordingsOnDisk()
             return self._on_disk
 
+    def words(self) -> Vectors | None:
+        """What makes vectors of words, each of them once; None where `SEMDB_WORDS` is not set. Raises ModelError."""
+        from semdb.perception.word_vectors import load_words
+
+        with self._turn:
+            self.check_open()
+            if self._words is None:
+                network = load_words(self.settings)
+                self._words = None if network is None else _remembered(network.vectors)
+            return self._words
+
     @contextmanager
     def describers(self) -> Iterator[Describers]:
         """The networks of earlier ingests; two ingests at once have their own."""
@@ -89,13 +105,30 @@ class Here:
         with self._turn:
             self._closed = True
             store, maps = self._store, self._maps
-            self._store, self._maps, self._describers = None, None, {}
+            self._store, self._maps, self._describers, self._words = None, None, {}, None
         try:
             if maps is not None:
                 maps.close()
         finally:
             if store is not None:
                 store.close()
+
+
+def _remembered(make: Vectors) -> Vectors:
+    """`make`, which is asked for each text once."""
+    import numpy as np
+
+    known: dict[str, Float32Array] = {}
+
+    def vectors(texts: Sequence[str]) -> Float32Array:
+        new = [text for text in dict.fromkeys(texts) if text not in known]
+        if len(known) + len(new) > MOST_WORDS:
+            known.clear()
+            new = list(dict.fromkeys(texts))
+        known.update(zip(new, make(new), strict=True))
+        return np.stack([known[text] for text in texts])
+
+    return vectors
 
 
 class HasHere(Protocol):

@@ -122,7 +122,8 @@ class Reading(Base):
 
         They may have to stand `near` or `on` something, or `not_near` it, and to have been seen after a time (also in
         nanoseconds), or in the recording of that name. The nearer to `origin` (X, Y, Z) the better. Where there is no
-        hit, `missing` says why. Raises UsageError for words that mean nothing, NotFoundError.
+        hit, `missing` says why. Raises UsageError for words that mean nothing, NotFoundError, and ModelError where
+        `SEMDB_WORDS` names no network for words.
         """
         from semdb.api.finding import find
 
@@ -135,6 +136,7 @@ class Reading(Base):
             seen_after=seen_after,
             origin=origin,
             limit=limit,
+            vectors=self._here.words,
         )
 
     def landmarks(self, map: str) -> list[StoredLandmark]:

@@ -188,6 +188,7 @@ def models(settings: Settings) -> Iterator[Check]:
         "encoder": load_encoder,
         "features": load_features,
     }
+    yield from words(settings)
     for role, load in loaders.items():
         spec = str(getattr(settings, role))
         if spec == "auto":
@@ -198,3 +199,20 @@ def models(settings: Settings) -> Iterator[Check]:
             yield Check("ok", role, spec)
         except SemdbError as error:
             yield Check("problem", role, str(error))
+
+
+def words(settings: Settings) -> Iterator[Check]:
+    """Whether words that no table has can be understood by their vectors."""
+    from semdb.errors import SemdbError
+    from semdb.perception.word_vectors import load_words
+
+    try:
+        network = load_words(settings)
+    except SemdbError as error:
+        yield Check("problem", "words", str(error))
+        return
+    if network is None:
+        yield Check("info", "words", "SEMDB_WORDS is not set: `semdb find` knows the words of its tables only")
+        return
+    likeness = float(network.vectors(["mug"])[0] @ network.vectors(["cup"])[0])
+    yield Check("ok", "words", f"{network.info.name}: mug is like cup by {likeness:.2f}")

@@ -7,10 +7,17 @@ docs/landmarks.md.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from semdb.errors import UsageError
+from semdb.types import Float32Array
+
+LEAST_COSINE = 0.55  # of a word with one that is known, before it is taken for it
+HINT_COSINE = 0.4  # before it is offered
+Vectors = Callable[[Sequence[str]], Float32Array]  # texts to unit vectors [n, d]
 
 SYNONYMS: Mapping[str, str] = {
     "armchair": "chair",
@@ -119,17 +126,28 @@ SAID_AS: Mapping[str, str] = {
 
 @dataclass(frozen=True, slots=True)
 class Understood:
-    """What a word was taken for: `classes`, by `how` (class, synonym, kind or use)."""
+    """What a word was taken for: `classes`, by `how` (class, synonym, kind, use or vector).
+
+    By its vector it was taken for `like`, a word that is known; `cosine` is that of the two.
+    """
 
     said: str
     classes: tuple[str, ...]
     how: str
+    like: str | None = None
+    cosine: float | None = None
+
+    def as_dict(self) -> dict[str, object]:
+        """What JSON has."""
+        by_vector = {} if self.like is None else {"like": self.like, "cosine": self.cosine}
+        return {"said": self.said, "classes": list(self.classes), "how": self.how, **by_vector}
 
 
-def understand(said: str, known: Collection[str]) -> Understood:
+def understand(said: str, known: Collection[str], vectors: Callable[[], Vectors | None] = lambda: None) -> Understood:
     """The classes that somebody means by a word. `known` are the names of the classes of the database.
 
-    Raises UsageError for a word that is none, with what is like it.
+    A word that is in no table is taken for the one whose vector is nearest, where `vectors`, which is asked only then,
+    has something that makes them. Raises UsageError for a word that is none, with what is like it.
     """
     word = " ".join(said.strip().lower().split())
     names = {name.lower(): name for name in sorted(known)}
@@ -151,8 +169,38 @@ def understand(said: str, known: Collection[str]) -> Understood:
             return Understood(said, (form,), "class")
     choices = sorted({*names, *SYNONYMS, *KINDS, *GOOD_FOR, *_every_class()})
     near = difflib.get_close_matches(word, choices, 3)
+    make = vectors()
+    if make is not None:
+        found, alike = _nearest(said, _forms(word)[0], _phrases(known), make)
+        if found is not None:
+            return found
+        near = list(dict.fromkeys([*near, *alike]))[:3]
     hint = f"; did you mean {', '.join(near)}?" if near else ""
     raise UsageError(f"{said!r} is no class of this database, and no word for one{hint}")
+
+
+def _phrases(known: Collection[str]) -> dict[str, tuple[str, ...]]:
+    """All that can be said, with what it means."""
+    found: dict[str, tuple[str, ...]] = {name: (name,) for name in sorted({*known, *_every_class()})}
+    found |= {word: (name,) for word, name in SYNONYMS.items() if word not in found}
+    found |= {word: names for word, names in KINDS.items() if word not in found}
+    found |= {use.replace("-", " "): names for use, names in GOOD_FOR.items()}
+    return found | {word: GOOD_FOR.get(use) or KINDS[use] for word, use in SAID_AS.items()}
+
+
+def _nearest(
+    said: str, word: str, phrases: Mapping[str, tuple[str, ...]], make: Vectors
+) -> tuple[Understood | None, list[str]]:
+    """What `word` is taken for by vectors, and the three phrases that are most like it."""
+    texts = list(phrases)
+    cosines = make(texts).astype(np.float64) @ make([word])[0]
+    order = np.argsort(-cosines, kind="stable")[:3]
+    best = int(order[0])
+    alike = [texts[k] for k in order if cosines[k] >= HINT_COSINE]
+    if cosines[best] < LEAST_COSINE:
+        return None, alike
+    cosine = round(float(cosines[best]), 3)
+    return Understood(said, phrases[texts[best]], "vector", texts[best], cosine), alike
 
 
 def _forms(word: str) -> list[str]:
