@@ -16,6 +16,7 @@ from semdb.database.landmark_records import (
     LandmarkSet,
     LandmarkSighting,
     LandmarkView,
+    LandmarkVisit,
 )
 from semdb.database.landmark_rows import replace_landmarks
 from semdb.database.records import KeyframeRecord, RecordingPlan
@@ -166,6 +167,12 @@ def stored_landmarks(store: Store, map_id: int) -> list[int]:
                 *(max(len(mine), 1), 1, 0, "confirmed", seen[0][1], seen[-1][1], 10**9 * number, 10**9 * (number + 5)),
                 tuple(LandmarkSighting(key, 0.9, 0.8) for key, _ in mine),
                 tuple(LandmarkView(key, 0.7, 1.5) for key, _ in mine[:3]),
+                (
+                    LandmarkVisit("first visit", "present", 1, 0, 0, 0, 0, 0, position, size),
+                    LandmarkVisit(
+                        "second visit", "absent" if name == "book" else "unobserved", 0, 9, 0, 9, 0, 0, None, None
+                    ),
+                ),
             )
         )
     relations = [

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from semdb.geometry import pose_from, so3_exp
+from semdb.landmarks.appearance import colours_of
 from semdb.landmarks.boxes import Box
 from semdb.landmarks.build import SeenKeyframe
 from semdb.landmarks.lift import SeenObject, lift_keyframe
 from semdb.landmarks.options import LandmarkOptions
 from semdb.recordings.synthetic import SyntheticOptions, SyntheticSequence
 from semdb.recordings.synthetic.mistakes import MISNAMED, make_mistakes, with_misnamed
-from semdb.types import BoolArray, Camera, Float32Array, FloatArray
+from semdb.types import BoolArray, Camera, Float32Array, FloatArray, ImageArray
 
 LEAST_SIDE = 0.03  # metres
 SMALLEST = 60  # pixels: a mask of fewer is none
@@ -50,6 +51,7 @@ class RoomFrame:
     labels: npt.NDArray[np.uint16]  # [H, W]
     depth: Float32Array  # [H, W] exact
     noisy: Float32Array  # [H, W]
+    rgb: ImageArray  # [H, W, 3]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,6 +63,16 @@ class RenderedRoom:
     classes: dict[int, str]
     axes: dict[int, FloatArray]
     frames: tuple[RoomFrame, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RenderedVisit:
+    """A visit of a room: where its things stand ``[4, 4]`` by label, which of them were moved, and which taken away."""
+
+    room: RenderedRoom
+    places: dict[int, FloatArray]
+    moved: tuple[int, ...]
+    taken: tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,13 +89,27 @@ def render_room(seed: int, keyframes: int = 24, width: int = 640, place: int = 0
     lap = max(8, keyframes // laps)
     size = {"width": width, "height": width * 3 // 4}
     shared = {"frames": keyframes, "lap_frames": lap, "room_seed": seed, "seed": seed, "place": place, **size}
-    clean, noisy = (SyntheticSequence(SyntheticOptions(**shared, noise=noise)) for noise in (False, True))
+    return _rendered(SyntheticOptions(**shared))[0]
+
+
+def render_visit(seed: int, keyframes: int, width: int, taken: float | None) -> RenderedVisit:
+    """A visit of the room of a seed: the first, or with `taken` the second, that share of small things taken away."""
+    second = {} if taken is None else {"second_visit": True, "taken": taken}
+    size = {"width": width, "height": width * 3 // 4}
+    options = SyntheticOptions(frames=keyframes, lap_frames=max(8, keyframes), room_seed=seed, seed=seed, **size)
+    room, sequence = _rendered(replace(options, **second))
+    places = {item.label: item.pose for item in sequence.room.items if item.category is not None}
+    return RenderedVisit(room, places, sequence.moved, sequence.taken)
+
+
+def _rendered(options: SyntheticOptions) -> tuple[RenderedRoom, SyntheticSequence]:
+    clean, noisy = (SyntheticSequence(replace(options, noise=noise)) for noise in (False, True))
     frames = []
-    for index in range(keyframes):
+    for index in range(options.frames):
         view, seen = clean.render(index), noisy.render(index)
-        frames.append(RoomFrame(view.world_from_camera, view.labels, view.depth, seen.depth))
+        frames.append(RoomFrame(view.world_from_camera, view.labels, view.depth, seen.depth, view.rgb))
     axes = {item.label: item.pose[:3, :3] for item in clean.room.items if item.category is not None}
-    return RenderedRoom(seed, clean.camera, clean.classes, axes, tuple(frames))
+    return RenderedRoom(options.room_seed, clean.camera, clean.classes, axes, tuple(frames)), clean
 
 
 def class_numbers(rooms: Sequence[RenderedRoom]) -> dict[str, int]:
@@ -118,7 +144,8 @@ def seen_keyframes(
         depth = frame.noisy if mistakes.depth_noise else frame.depth
         lifted = lift_keyframe(room.camera, pose, depth, objects, options.lift, options.see)
         category = np.array([thing.category for thing in objects], np.int64)
-        found.append(SeenKeyframe(lifted, category, np.full(len(objects), 0.9), recording))
+        scores, colours = np.full(len(objects), 0.9), colours_of(frame.rgb, lifted)
+        found.append(SeenKeyframe(lifted, category, scores, recording, colours=colours))
         labels.append(true)
     return found, labels
 

@@ -85,7 +85,7 @@ def score(
                 centres.append(float(np.linalg.norm(there[row].box.centre - things[key].box.centre)))
                 right += names[there[row].category] == things[key].category
                 classes += 1
-    main = [_main(thing, labels) for thing in there]
+    main = [main_label(thing, labels) for thing in there]
     pairs = _pairs(landmarks, labels)
     duplicates = len(main) - len(set(main))
     return Score(
@@ -94,7 +94,7 @@ def score(
     )
 
 
-def _main(thing: Landmark, labels: Sequence[Sequence[int]]) -> int:
+def main_label(thing: Landmark, labels: Sequence[Sequence[int]]) -> int:
     """The label that most of a landmark's sightings have."""
     counts: dict[int, int] = {}
     for member in thing.members:
@@ -130,7 +130,7 @@ def relation_counts(
     Between confirmed landmarks, one of each thing, with scores of at least one half; where the true boxes give 0.3 to
     0.7 it may be either.
     """
-    there = {_main(thing, labels): thing for thing in landmarks if thing.state is LandmarkState.CONFIRMED}
+    there = {main_label(thing, labels): thing for thing in landmarks if thing.state is LandmarkState.CONFIRMED}
     keys = sorted(key for key in there if key in things)
     up = np.array([0.0, 0.0, 1.0])
     true = [_as_landmark(things[key], names) for key in keys]

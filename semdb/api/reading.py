@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from semdb.database.landmark_reading import StoredLandmark
     from semdb.database.reporting import WorkerStatus
+    from semdb.door.changed import Changes
     from semdb.door.found import Found
     from semdb.door.links import KeyframeLink
     from semdb.localization.query_image import PathText
@@ -138,6 +139,24 @@ class Reading(Base):
             limit=limit,
             vectors=self._here.words,
         )
+
+    def changes(self, before: str, after: str, map: str | None = None) -> Changes:
+        """What appeared, disappeared and moved from one recording of a map to another one, and what both say of each
+        landmark.
+
+        `map` is needed where several have both. Raises UsageError, NotFoundError also where there are no landmarks.
+        """
+        from semdb.api.changing import changes_of
+
+        return changes_of(self._store(), before, after, map)
+
+    def plot_changes(self, found: Changes, folder: PathText) -> list[Path]:
+        """Draws the map from above with what changed, as ``MAP-changes.png``, and the crops before and after, as
+        ``MAP-crops.png``. Returns the files. Raises UsageError for a folder that cannot be written.
+        """
+        from semdb.api.plotting import plot_changes
+
+        return plot_changes(self._store(), found, Path(folder))
 
     def landmarks(self, map: str) -> list[StoredLandmark]:
         """The landmarks of a map by id. Raises NotFoundError, CodecError for a damaged row."""

@@ -35,6 +35,7 @@ COMMANDS: dict[str, str] = {
     "refine": "semdb.cli.refine",
     "align": "semdb.cli.align",
     "find": "semdb.cli.find",
+    "changes": "semdb.cli.changes",
     "loops": "semdb.cli.loops",
     "localize": "semdb.cli.localize",
     "evaluate": "semdb.cli.evaluate",

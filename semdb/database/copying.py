@@ -23,7 +23,14 @@ from semdb.errors import DatabaseError, UsageError
 SHARED = {"models": "digest", "cameras": "digest", "categories": "name"}
 ORDER = ("maps", "recordings", "keyframes", "objects")  # what else hangs from, each from the one before
 # logs, and what links two keyframes, which goes when both are there
-LANDMARKS = ("landmarks", "landmark_sightings", "landmark_views", "landmark_relations", "landmark_merges")
+LANDMARKS = (
+    "landmarks",
+    "landmark_sightings",
+    "landmark_views",
+    "landmark_visits",
+    "landmark_relations",
+    "landmark_merges",
+)
 NOT_COPIED = ("queries", "keyframe_changes", "pose_operations", "pose_revisions", "loop_closures", *LANDMARKS)
 CHUNK = 16  # keyframes that are read at a time
 Progress = Callable[[int, int], None]

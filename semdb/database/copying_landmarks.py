@@ -32,8 +32,14 @@ def copy_landmarks(
     mine = select(m.id).where(m.map_id == map_id)
     hanging = {
         table: _rows(source, select(table).where(table.c.landmark_id.in_(mine)))
-        for table in (tables.landmark_sightings, tables.landmark_views, tables.landmark_relations)
+        for table in (
+            tables.landmark_sightings,
+            tables.landmark_views,
+            tables.landmark_visits,
+            tables.landmark_relations,
+        )
     }
+    recordings = _recordings(source, map_id, target, target_map_id)
 
     def work(connection: Connection) -> None:
         ids: dict[int, int] = {}
@@ -44,13 +50,18 @@ def copy_landmarks(
                 values[name] = None if row[name] is None else keyframes.get(int(row[name]))
             ids[int(row["id"])] = new_id(connection, tables.landmarks, values)
         for table, found in hanging.items():
-            _insert(connection, table, found, ids, objects)
+            _insert(connection, table, found, ids, objects, recordings)
 
     retry.write(target, work)
 
 
 def _insert(
-    connection: Connection, table: Table, rows: list[dict[str, Any]], ids: Mapping[int, int], objects: Mapping[int, int]
+    connection: Connection,
+    table: Table,
+    rows: list[dict[str, Any]],
+    ids: Mapping[int, int],
+    objects: Mapping[int, int],
+    recordings: Mapping[int, int],
 ) -> None:
     made = []
     for row in rows:
@@ -62,9 +73,23 @@ def _insert(
             if int(values["object_id"]) not in objects:
                 continue
             values["object_id"] = objects[int(values["object_id"])]
+        if "recording_id" in values:
+            if int(values["recording_id"]) not in recordings:
+                continue
+            values["recording_id"] = recordings[int(values["recording_id"])]
         made.append(values)
     for start in range(0, len(made), 500):
         connection.execute(insert(table), made[start : start + 500])
+
+
+def _recordings(source: Engine, map_id: int, target: Engine, target_map_id: int) -> dict[int, int]:
+    """Ids of recordings in the target by those in the source."""
+    r = tables.recordings.c
+    there = {
+        row["name"]: int(row["id"]) for row in _rows(target, select(r.name, r.id).where(r.map_id == target_map_id))
+    }
+    here = _rows(source, select(r.name, r.id).where(r.map_id == map_id))
+    return {int(row["id"]): there[row["name"]] for row in here if row["name"] in there}
 
 
 def _places(engine: Engine, map_id: int) -> dict[Place, tuple[str, int]]:

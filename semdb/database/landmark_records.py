@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from semdb.types import Camera, FloatArray
+from semdb.types import Camera, Float32Array, FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +38,25 @@ class LandmarkView:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class LandmarkVisit:
+    """What a recording says of a landmark: see `semdb.landmarks.visits.Visit`. `recording` is a name in the map.
+
+    `position` and `size` are of what that recording saw of it; None where it did not.
+    """
+
+    recording: str
+    presence: str
+    keyframes: int
+    points: int
+    seen: int
+    seen_through: int
+    occluded: int
+    missed: int
+    position: tuple[float, float, float] | None
+    size: tuple[float, float, float] | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class LandmarkRow:
     """A landmark as it is stored, but for its id."""
 
@@ -58,6 +77,8 @@ class LandmarkRow:
     last_seen_ns: int | None
     sightings: tuple[LandmarkSighting, ...]
     views: tuple[LandmarkView, ...]
+    visits: tuple[LandmarkVisit, ...] = ()
+    appearance: Float32Array | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +112,7 @@ class KeyframeObject:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyframeDepth:
-    """What landmarks are made of: a keyframe's pose, depth file (as recorded, None without) and objects by ordinal."""
+    """What landmarks are made of: a keyframe's pose, files (as recorded, depth None without) and objects by ordinal."""
 
     id: int
     recording: str
@@ -99,6 +120,7 @@ class KeyframeDepth:
     timestamp_ns: int | None
     camera: Camera
     world_from_camera: FloatArray  # [4, 4]
+    rgb: bytes
     depth: bytes | None
     depth_scale: float | None
     depth_registration: str

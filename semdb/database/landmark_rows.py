@@ -13,6 +13,7 @@ from typing import Any, Protocol
 from sqlalchemy import Connection, Engine, delete, insert, select, update
 
 from semdb.database import checked, retry
+from semdb.database.codecs import encode_array
 from semdb.database.ids import new_id
 from semdb.database.landmark_records import (
     GravityRow,
@@ -30,15 +31,18 @@ from semdb.database.tables import (
     landmark_relations,
     landmark_sightings,
     landmark_views,
+    landmark_visits,
     landmarks,
     map_gravity,
     objects,
+    recordings,
 )
 from semdb.errors import CodecError
 
 LANDMARKS = "landmarks"  # the step of `semdb refine`
 CHUNK = 500
 READ_CHUNK = 16  # keyframes
+VISIT_COUNTS = ("keyframes", "points", "seen", "seen_through", "occluded", "missed")
 _UP = ("up_x", "up_y", "up_z")
 
 
@@ -80,8 +84,8 @@ def iter_keyframe_depths(engine: Engine, map_id: int, bad: Bad | None = None) ->
 
 def _rows_of(engine: Engine, keys: Sequence[int]) -> tuple[dict[int, Any], dict[int, list[Any]]]:
     i, o = keyframe_images.c, objects.c
-    depth = checked.up_to(i.depth, checked.MOST_FILE)
-    of_images = select(i.keyframe_id, depth, i.depth_scale, i.depth_registration).where(i.keyframe_id.in_(keys))
+    rgb, depth = (checked.up_to(column, checked.MOST_FILE) for column in (i.rgb, i.depth))
+    of_images = select(i.keyframe_id, rgb, depth, i.depth_scale, i.depth_registration).where(i.keyframe_id.in_(keys))
     mask = checked.up_to(o.mask, checked.MOST_MASK)
     of_objects = (
         select(o.id, o.keyframe_id, o.score, mask, categories.c.name)
@@ -115,6 +119,7 @@ def _keyframe(head: KeyframeHead, image: Any, things: Sequence[Any]) -> Keyframe
         timestamp_ns=head.timestamp_ns,
         camera=head.camera,
         world_from_camera=head.world_from_camera,
+        rgb=checked.blob(image.rgb, f"keyframe_images.rgb {where}"),
         depth=depth,
         depth_scale=depth_scale_of(image.depth_scale, head.id),
         depth_registration=checked.text(image.depth_registration, f"keyframe_images.depth_registration {where}", 32),
@@ -152,6 +157,7 @@ def replace_landmarks(connection: Connection, map_id: int, found: LandmarkSet, k
         for k, v in enumerate(row.views)
     ]
     _insert(connection, landmark_views, views)
+    _insert(connection, landmark_visits, _visit_rows(connection, map_id, numbered))
     relations = [
         {"landmark_id": ids[r.one], "kind": r.kind, "other_landmark_id": ids[r.other], "score": r.score}
         for r in found.relations
@@ -160,6 +166,28 @@ def replace_landmarks(connection: Connection, map_id: int, found: LandmarkSet, k
     _keep_merges(connection, map_id, {key: ids[number] for key, number in kept.merged.items()}, set(ids))
     set_gravity(connection, map_id, found.gravity)
     return len(ids)
+
+
+def _visit_rows(
+    connection: Connection, map_id: int, numbered: Sequence[tuple[int, LandmarkRow]]
+) -> list[dict[str, Any]]:
+    r = recordings.c
+    query = select(r.name, r.id).where(r.map_id == map_id)
+    known = {str(name): int(key) for name, key in connection.execute(query)}
+    none = (None, None, None)
+    return [
+        {
+            "landmark_id": key,
+            "recording_id": known[v.recording],
+            "presence": v.presence,
+            **{name: getattr(v, name) for name in VISIT_COUNTS},
+            **dict(zip("xyz", v.position or none, strict=True)),
+            **dict(zip(("size_x", "size_y", "size_z"), v.size or none, strict=True)),
+        }
+        for key, row in numbered
+        for v in row.visits
+        if v.recording in known  # deleted meanwhile: then the map is of another state, and this is out of date
+    ]
 
 
 def _landmark_of_objects(connection: Connection, map_id: int) -> dict[int, int]:
@@ -201,6 +229,7 @@ def _values(row: LandmarkRow) -> dict[str, Any]:
         "last_keyframe_id": row.last_keyframe_id,
         "first_seen_ns": row.first_seen_ns,
         "last_seen_ns": row.last_seen_ns,
+        "appearance": None if row.appearance is None else encode_array(row.appearance),
     }
 
 

@@ -24,6 +24,17 @@ def once(say: Callable[[str], None]) -> Callable[[str], None]:
     return new
 
 
+def telling(say: Callable[[str], None] | None) -> Callable[[str], None]:
+    """`say`, or where there is none to hear it an event of the level warning."""
+    if say is not None:
+        return say
+
+    def new(line: str) -> None:
+        event("remark", level=logging.WARNING, message=line)
+
+    return new
+
+
 class LeftOut:
     """Takes what reading functions hand to `bad`. Safe to share between threads."""
 

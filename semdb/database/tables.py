@@ -464,6 +464,18 @@ landmark_views = _table(
     Column("distance", Double, nullable=False),
 )
 
+landmark_visits = _table(
+    "landmark_visits",
+    _ref("landmark_id", "landmarks.id", primary_key=True),
+    _ref("recording_id", "recordings.id", primary_key=True, index=True),
+    Column("presence", String(16), nullable=False),
+    *(
+        Column(name, Integer, nullable=False)
+        for name in ("keyframes", "points", "seen", "seen_through", "occluded", "missed")
+    ),
+    *(Column(name, Double) for name in ("x", "y", "z", "size_x", "size_y", "size_z")),
+)
+
 landmark_relations = _table(
     "landmark_relations",
     _ref("landmark_id", "landmarks.id", primary_key=True),

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from semdb.landmarks.appearance import mean_colours
 from semdb.landmarks.boxes import shared_volume, upright_box
 from semdb.landmarks.clustering import UNIT, clusters
 from semdb.landmarks.evidence import fuse, name_probabilities
@@ -23,7 +24,8 @@ from semdb.landmarks.register import corrected_poses
 from semdb.landmarks.shape import thing_points
 from semdb.landmarks.values import BestView, Landmark, Landmarks, LandmarkState, Member
 from semdb.landmarks.visibility import IN_VIEW, THROUGH, VISIBLE, Sightings, Views, collect, look
-from semdb.types import FloatArray, Int64Array
+from semdb.landmarks.visits import Presence, visits_of
+from semdb.types import Float32Array, FloatArray, Int64Array
 
 Progress = Callable[[int, int], None]
 EXPECTED = 0.5  # share of a thing's points in sight: the detector should have seen it
@@ -41,6 +43,7 @@ class SeenKeyframe:
     score: FloatArray  # [objects]
     recording: int  # number of the recording, in the order of the names
     time_ns: int | None = None  # of the clock on the wall, where the recording has such times
+    colours: Float32Array | None = None  # [sightings, n] see `appearance`; None where its image is none
 
 
 def find_landmarks(
@@ -161,7 +164,7 @@ class _Assembly:
                 self._rows[one] = np.sort(np.concatenate([self._rows[one], self._rows.pop(other)]))
                 del things[other]
                 things[one] = self.landmark(one)
-        return list(things.values())
+        return [self.visited(root, thing) for root, thing in things.items()]
 
     def _at_one_place(self, things: Mapping[int, Landmark]) -> list[tuple[int, int, int]]:
         """Pairs of clusters that are one thing: overlap (negative, thousandths), one, other; the surest first."""
@@ -189,9 +192,7 @@ class _Assembly:
     def landmark(self, root: int) -> Landmark:
         """The landmark of the sightings of a cluster."""
         rows, options = self._rows[root], self._options
-        members: dict[int, list[int]] = {}
-        for row in rows.tolist():
-            members.setdefault(int(self._sightings.keyframe[row]), []).append(int(self._sightings.label[row]) - 1)
+        members = self._members(rows)
         points = thing_points(self._lifted, members, options.see, options.shape)
         box = upright_box(points, self._gravity.up, options.shape.trim)
         objects = [(k, int(o)) for k, s in sorted(members.items()) for one in sorted(s) for o in self._ordinals(k, one)]
@@ -223,7 +224,37 @@ class _Assembly:
             last=times[-1],
             state=state,
             views=self._best_views(listed, box.centre),
+            colours=self._colours(rows),
         )
+
+    def _members(self, rows: Int64Array) -> dict[int, list[int]]:
+        """Numbers of sightings by keyframe."""
+        members: dict[int, list[int]] = {}
+        for row in rows.tolist():
+            members.setdefault(int(self._sightings.keyframe[row]), []).append(int(self._sightings.label[row]) - 1)
+        return members
+
+    def visited(self, root: int, thing: Landmark) -> Landmark:
+        """A landmark with what each visit says of it."""
+        rows, options = self._rows[root], self._options
+        candidates = [self._views.keyframe[self._first_view[r] : self._first_view[r + 1]] for r in rows.tolist()]
+        visits = visits_of(
+            self._lifted,
+            [frame.recording for frame in self._keyframes],
+            self._members(rows),
+            np.unique(np.concatenate(candidates)),
+            thing.box,
+            self._gravity.up,
+            (options.see, options.shape, options.visit),
+        )
+        after = [v for v in visits if self._is_later(self._first_of(v.recording), thing.last)]
+        gone = any(visit.presence is Presence.ABSENT for visit in after)
+        gone &= all(visit.presence is not Presence.PRESENT for visit in after)
+        return replace(thing, visits=visits, state=LandmarkState.GONE if gone else thing.state)
+
+    def _first_of(self, recording: int) -> int:
+        """The first keyframe of a recording."""
+        return next(k for k, frame in enumerate(self._keyframes) if frame.recording == recording)
 
     def _ordinals(self, keyframe: int, sighting: int) -> Int64Array:
         return _objects_of(self._keyframes[keyframe], sighting)
@@ -288,6 +319,15 @@ class _Assembly:
             return np.asarray(np.eye(3) * (0.1 * float(size.max())) ** 2 + noise, np.float64)
         apart = centres - centres.mean(axis=0)
         return np.asarray((apart.T @ apart / (count - 1) + noise) / count + least, np.float64)
+
+    def _colours(self, rows: Int64Array) -> Float32Array | None:
+        """The mean of what its sightings look like; None where no image is known."""
+        found = []
+        for row in rows.tolist():
+            colours = self._keyframes[int(self._sightings.keyframe[row])].colours
+            if colours is not None:
+                found.append(colours[int(self._sightings.label[row]) - 1])
+        return mean_colours(np.array(found)) if found else None
 
     def _best_views(self, members: Sequence[Member], centre: FloatArray) -> tuple[BestView, ...]:
         found: dict[int, BestView] = {}

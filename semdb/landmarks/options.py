@@ -99,6 +99,26 @@ class ShapeOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class VisitOptions:
+    """What a visit says of a thing that it shows no sighting of.
+
+    `points` of the thing are looked up, evenly taken. One is seen within `near_m` + `near_share` of its depth, and seen
+    through where all that was measured about it is farther by `through_m` + `through_share_of_depth`. A thing is absent
+    where at least `through_share` of its points are seen through, and `through_to_seen` times as many as are seen. A
+    keyframe that sees `missed_share` of them in no mask missed it.
+    """
+
+    points: int = 400
+    near_m: float = 0.02
+    near_share: float = 0.005
+    through_m: float = 0.03
+    through_share_of_depth: float = 0.01
+    through_share: float = 0.4
+    through_to_seen: float = 1.0
+    missed_share: float = 0.5
+
+
+@dataclass(frozen=True, slots=True)
 class LandmarkOptions:
     """All options. A landmark is confirmed by so many keyframes, which are at least a share of those that should have
     seen it; `gone`: later keyframes that see through it. `one_place`: two that no keyframe saw beside each other are
@@ -110,6 +130,7 @@ class LandmarkOptions:
     register: RegisterOptions = RegisterOptions()
     link: LinkOptions = LinkOptions()
     shape: ShapeOptions = ShapeOptions()
+    visit: VisitOptions = VisitOptions()
     confirmed: int = 3
     confirmed_share: float = 0.2
     gone: int = 2

@@ -7,7 +7,8 @@ from enum import StrEnum
 
 from semdb.landmarks.boxes import Box
 from semdb.landmarks.gravity import Gravity
-from semdb.types import FloatArray
+from semdb.landmarks.visits import Visit
+from semdb.types import Float32Array, FloatArray
 
 
 class LandmarkState(StrEnum):
@@ -57,6 +58,8 @@ class Landmark:
     last: int
     state: LandmarkState
     views: tuple[BestView, ...]  # the best first
+    colours: Float32Array | None = None  # the mean of its sightings', see `appearance`
+    visits: tuple[Visit, ...] = ()  # by number of the recording
 
     @property
     def key(self) -> tuple[int, int]:

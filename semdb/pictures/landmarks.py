@@ -29,9 +29,16 @@ class Footprint:
 
 
 def draw_landmarks(
-    footprints: Sequence[Footprint], cameras: FloatArray, title: str, found: Collection[int] = ()
+    footprints: Sequence[Footprint],
+    cameras: FloatArray,
+    title: str,
+    found: Collection[int] = (),
+    arrows: Sequence[tuple[FloatArray, FloatArray]] = (),
 ) -> ImageArray:
-    """The picture as RGB ``[H, W, 3]``; `cameras` ``[n, 2]`` are positions along the level axes, `found` ids."""
+    """The picture as RGB ``[H, W, 3]``; `cameras` ``[n, 2]`` are positions along the level axes, `found` ids.
+
+    `arrows` from ``[2]`` to ``[2]``.
+    """
     figure = Figure(figsize=(SIZE[0] / DPI, SIZE[1] / DPI), dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
     axes = figure.add_axes((0.06, 0.06, 0.91, 0.87))
@@ -56,6 +63,11 @@ def draw_landmarks(
         axes.text(
             float(x), float(y), for_plot(f"{item.category} {item.id}"), fontsize=9 if hit else 7,
             color=FOUND if hit else INK, ha="center", va="center", zorder=8, clip_on=True,
+        )  # fmt: skip
+    for start, end in arrows:
+        axes.annotate(
+            "", xy=(float(end[0]), float(end[1])), xytext=(float(start[0]), float(start[1])), zorder=9,
+            arrowprops={"arrowstyle": "->", "color": FOUND, "lw": 1.8},
         )  # fmt: skip
     axes.autoscale_view()
     axes.tick_params(labelsize=9, colors=FAINT)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from sqlalchemy import Connection
@@ -19,7 +19,9 @@ from semdb.database.landmark_records import (
     LandmarkSet,
     LandmarkSighting,
     LandmarkView,
+    LandmarkVisit,
 )
+from semdb.database.left_out import telling
 from semdb.database.store import Store
 from semdb.errors import CodecError, FrameError
 from semdb.landmarks.options import LandmarkOptions
@@ -27,9 +29,13 @@ from semdb.refinement.class_step import placed_objects
 from semdb.refinement.confusion import MILLION, ConfusionOptions, co_detections, confusions
 from semdb.types import Float32Array, FloatArray
 
+if TYPE_CHECKING:
+    from semdb.landmarks.lift import LiftedKeyframe
+    from semdb.landmarks.visits import Visit
+
 CLOCK_NS = 10**17  # times from here on (1973) are of the clock on the wall; smaller ones begin with their recording
 LEAST_EVIDENCE = 0.0005
-REVISION = 1  # of the computation: another one makes what is stored out of date
+REVISION = 2  # of the computation: another one makes what is stored out of date
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +84,8 @@ class LandmarkStep:
             category = np.array([thing.category for thing in things], np.int64)
             score = np.array([thing.score for thing in things], np.float64)
             time = row.timestamp_ns if row.timestamp_ns is not None and row.timestamp_ns >= CLOCK_NS else None
-            return SeenKeyframe(lifted, category, score, recordings.setdefault(row.recording, len(recordings)), time)
+            number = recordings.setdefault(row.recording, len(recordings))
+            return SeenKeyframe(lifted, category, score, number, time, colours_in(row, lifted, telling(store.say)))
 
         recordings: dict[str, int] = {}
         for chunk in landmark_rows.iter_keyframe_depths(store.engine, map_id, store.left_out):
@@ -102,7 +109,7 @@ class LandmarkStep:
         wide = np.zeros((len(classes), len(classes)))
         wide[: len(names), : len(names)] = confusion
         found_all = find_landmarks(seen, len(classes), wide, up, self.options, show)
-        return _stored(found_all, rows, classes)
+        return _stored(found_all, rows, classes, list(recordings))
 
     def write(self, connection: Connection, map_id: int, result: LandmarkSet) -> int:
         from semdb.landmarks.identity import keep_ids
@@ -132,7 +139,34 @@ def depth_of(row: KeyframeDepth) -> Float32Array | None:
         raise CodecError(str(error)) from None
 
 
-def _stored(found: Any, rows: Sequence[KeyframeDepth], classes: Sequence[str]) -> LandmarkSet:
+def colours_in(row: KeyframeDepth, lifted: LiftedKeyframe, say: Callable[[str], None]) -> Float32Array | None:
+    """What the sightings of a keyframe look like; None where its image is none of its camera."""
+    from semdb.landmarks.appearance import colours_of
+    from semdb.recordings.images import decode_color
+
+    try:
+        rgb = decode_color(row.rgb, f"keyframe_images.rgb of keyframe {row.id}")
+    except FrameError as error:
+        say(f"keyframe {row.id} says nothing of colours: {error}")
+        return None
+    if rgb.shape[:2] != (row.camera.height, row.camera.width):
+        return None
+    return colours_of(rgb, lifted)
+
+
+def _visit(visit: Visit, recordings: Sequence[str]) -> LandmarkVisit:
+    centre = size = None
+    if visit.box is not None:
+        x, y, z = (float(value) for value in visit.box.centre)
+        sx, sy, sz = (float(value) for value in visit.box.size)
+        centre, size = (x, y, z), (sx, sy, sz)
+    counts = (visit.keyframes, visit.points, visit.seen, visit.seen_through, visit.occluded, visit.missed)
+    return LandmarkVisit(recordings[visit.recording], str(visit.presence), *counts, centre, size)
+
+
+def _stored(
+    found: Any, rows: Sequence[KeyframeDepth], classes: Sequence[str], recordings: Sequence[str]
+) -> LandmarkSet:
     from semdb.landmarks.boxes import upright_axes
     from semdb.landmarks.relations import find_relations
 
@@ -171,6 +205,8 @@ def _stored(found: Any, rows: Sequence[KeyframeDepth], classes: Sequence[str]) -
                 views=tuple(
                     LandmarkView(rows[v.keyframe].objects[v.ordinal].id, v.quality, v.distance) for v in thing.views
                 ),
+                visits=tuple(_visit(visit, recordings) for visit in thing.visits),
+                appearance=thing.colours,
             )
         )
     related = find_relations(found.landmarks, classes, found.gravity.up)

@@ -36,6 +36,7 @@ VIEWS = {
     "keyframe_links",
     "landmark_list",
     "landmark_relations_named",
+    "landmark_visit_list",
 }
 
 
@@ -181,3 +182,20 @@ def test_a_map_of_before_gets_landmarks(engine: Engine, empty_url: str) -> None:
             assert_same(keyframe, description(index), index)
         assert load_gravity(engine, map_id) is None
         assert len(stored_landmarks(store, map_id)) == 7
+
+
+def test_landmarks_of_before_get_visits(engine: Engine, empty_url: str) -> None:
+    schema.upgrade(engine)
+    with open_store(empty_url) as store:
+        map_id, _, _ = fill(store)
+        stored_landmarks(store, map_id)
+    schema.downgrade(engine, "0009")
+    assert "landmark_visits" not in inspect(engine).get_table_names()
+    schema.upgrade(engine)
+    with engine.connect() as connection:
+        assert connection.execute(text("SELECT COUNT(*) FROM landmark_visits")).scalar() == 0
+        assert connection.execute(text("SELECT COUNT(*) FROM landmarks")).scalar() == 7
+    with open_store(empty_url) as store:
+        assert len(stored_landmarks(store, map_id)) == 7
+    with engine.connect() as connection:
+        assert connection.execute(text("SELECT COUNT(*) FROM landmark_visit_list")).scalar() == 7

@@ -169,6 +169,11 @@ def test_second_visit_moves_objects_and_shares_the_walls(sequence: SyntheticSequ
     after = {i.label: i.pose for i in second.room.items if i.label}
     moved = {k for k in before if not np.allclose(before[k], after[k])}
     assert moved == set(second.moved)
+    assert second.taken == ()
+    robbed = SyntheticSequence(dataclasses.replace(SMALL, second_visit=True, taken=0.5))
+    assert len(robbed.taken) >= 3
+    assert set(robbed.taken).isdisjoint(robbed.moved)
+    assert not any(np.isin(robbed.render(k).labels, robbed.taken).any() for k in range(2))
     assert len(moved) >= 4
     walls = [[i.pose for i in s.room.items if not i.label] for s in (sequence, second)]
     np.testing.assert_array_equal(walls[0], walls[1])

@@ -20,7 +20,8 @@ class SyntheticOptions:
     `room_seed` chooses furniture, layout and textures; `seed` the walk through the room, the noise and the lighting
     change. `lap_frames` is the number of frames in which the camera turns once around itself.
     `blur` is the share of the time between two frames during which the shutter is open. `lighting` scales a change
-    of gain, colour and direction of the light (1 is strong). `second_visit` walks another way, some objects moved.
+    of gain, colour and direction of the light (1 is strong). `second_visit` walks another way, some objects moved,
+    and a share `taken` of the small ones taken away.
     With `person` somebody walks to and fro before the camera.
     Rooms to be confused with others: `furniture_seed` puts the furniture of another seed into the room, `alike` mirrors
     every texture (same shapes, same colours, another room), `desks` furnishes it with so many equal workplaces.
@@ -39,6 +40,7 @@ class SyntheticOptions:
     blur: float = 0.0
     lighting: float = 0.0
     second_visit: bool = False
+    taken: float = 0.0
     lap_frames: int = 120
     furniture_seed: int | None = None
     alike: bool = False
@@ -59,6 +61,7 @@ class SyntheticOptions:
             ("room_seed", 0, 2**32 - 1),
             ("blur", 0.0, 1.0),
             ("lighting", 0.0, 1.0),
+            ("taken", 0.0, 1.0),
             ("lap_frames", 8, 1_000_000),
             ("furniture_seed", 0, 2**32 - 1),
             ("desks", 0, 8),

@@ -29,6 +29,19 @@ def move_objects(room: Room, seed: int, room_seed: int) -> list[int]:
     return moved
 
 
+def take_away(room: Room, share: float, seed: int, room_seed: int) -> list[int]:
+    """Takes about a `share` of the small objects out of the room; returns their labels."""
+    rng = np.random.default_rng([room_seed, 4, seed])
+    gone = [
+        item
+        for item in room.items
+        if item.category is not None and item.category != "chair" and item.spot is not None and rng.random() < share
+    ]
+    for item in gone:
+        item.prims.clear()
+    return [item.label for item in gone]
+
+
 def _move_on_spot(rng: np.random.Generator, item: Item) -> bool:
     spot = item.spot
     if spot is None:

@@ -28,7 +28,7 @@ from semdb.recordings.synthetic.render import Lamp, bake_light, render_view
 from semdb.recordings.synthetic.room import Room, build_room
 from semdb.recordings.synthetic.scene import PackedScene, mirrored, pack, plain, yaw_pose
 from semdb.recordings.synthetic.trajectory import walk
-from semdb.recordings.synthetic.visit import move_objects
+from semdb.recordings.synthetic.visit import move_objects, take_away
 from semdb.types import Float32Array, FloatArray, ImageArray
 
 _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 3]
@@ -49,17 +49,25 @@ _first_visit = lru_cache(maxsize=2)(build_room)
 
 @lru_cache(maxsize=2)
 def _scene(
-    room_seed: int, furniture_seed: int | None, desks: int, alike: bool, is_plain: bool, visit_seed: int | None
-) -> tuple[Room, PackedScene, tuple[int, ...]]:
-    """The lit room of a first (`visit_seed` None) or second visit, and the labels of what was moved."""
-    room, moved = _first_visit(room_seed, furniture_seed, desks), list[int]()
+    room_seed: int,
+    furniture_seed: int | None,
+    desks: int,
+    alike: bool,
+    is_plain: bool,
+    visit_seed: int | None,
+    share_taken: float,
+) -> tuple[Room, PackedScene, tuple[int, ...], tuple[int, ...]]:
+    """The lit room of a first (`visit_seed` None) or second visit, and the labels of what was moved and taken away."""
+    room, moved, taken = _first_visit(room_seed, furniture_seed, desks), list[int](), list[int]()
     if visit_seed is not None:
         room = copy.deepcopy(room)
         moved = move_objects(room, visit_seed, room_seed)
+        taken = take_away(room, share_taken, visit_seed, room_seed)
     items = mirrored(room.items) if alike else room.items
     if is_plain:
         items = plain(items)
-    return room, bake_light(pack(items), _lamps(room)), tuple(moved)
+    kept = tuple(label for label in moved if label not in taken)
+    return room, bake_light(pack(items), _lamps(room)), kept, tuple(taken)
 
 
 def _lamps(room: Room) -> list[Lamp]:
@@ -79,8 +87,9 @@ class SyntheticSequence:
         self.options = options
         self.camera = options.camera
         visit = options.seed if options.second_visit else None
-        self.room, self._packed, self.moved = _scene(
-            options.room_seed, options.furniture_seed, options.desks, options.alike, options.plain, visit
+        self.room, self._packed, self.moved, self.taken = _scene(
+            *(options.room_seed, options.furniture_seed, options.desks, options.alike, options.plain),
+            *(visit, options.taken),
         )
         self._walker = walker_for(self.room, options.seed) if options.person else None
         # one more pose than frames: the blur of the last frame needs where the camera goes next

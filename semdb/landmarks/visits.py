@@ -1,0 +1,173 @@
+"""What each visit (recording) of a map says of its landmarks: there, not there, or not looked at.
+
+Points that other visits saw of a landmark are looked up in the depth of all keyframes of a visit. A point is *seen*
+where a surface was measured, *seen through* where one farther away was, *occluded* where only nearer ones were. Only
+what was seen through is evidence that a thing is not there.
+"""
+
+# compiled functions take what numba infers
+# mypy: disable-error-code="no-untyped-call"
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from semdb.compiled import kernel
+from semdb.geometry import invert_pose
+from semdb.landmarks.boxes import Box, upright_box
+from semdb.landmarks.lift import LiftedKeyframe
+from semdb.landmarks.options import SeeOptions, ShapeOptions, VisitOptions
+from semdb.landmarks.shape import thing_points
+from semdb.types import FloatArray, Int64Array, IntArray
+
+Members = Mapping[int, Sequence[int]]  # numbers of sightings by keyframe
+SEEN, THROUGH, OCCLUDED = range(3)
+
+
+class Presence(StrEnum):
+    """Whether a visit shows a landmark. `unobserved`: too little of its place was looked at to say that it is not."""
+
+    PRESENT = "present"
+    ABSENT = "absent"
+    UNOBSERVED = "unobserved"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Visit:
+    """What one recording says of a landmark.
+
+    Of the `points` that other visits saw of it (0: no other did) so many were `seen`, `seen_through` and `occluded`;
+    the rest was out of view. `missed`: keyframes in which most of them are in sight, in no mask of it.
+    """
+
+    recording: int
+    presence: Presence
+    keyframes: int  # that show it
+    points: int
+    seen: int
+    seen_through: int
+    occluded: int
+    missed: int
+    box: Box | None  # of what this visit saw of it
+
+
+def visits_of(
+    lifted: Sequence[LiftedKeyframe],
+    recordings: Sequence[int],
+    members: Members,
+    candidates: Int64Array,
+    box: Box,
+    up: FloatArray,
+    options: tuple[SeeOptions, ShapeOptions, VisitOptions],
+) -> tuple[Visit, ...]:
+    """The visits of a landmark by number of recording, without those that never had it in view.
+
+    `recordings` are those of all keyframes, `members` the sightings of the landmark, `candidates` the keyframes that
+    may have it in view, `box` the landmark's.
+    """
+    see, shape, visit = options
+    by_visit: dict[int, dict[int, Sequence[int]]] = {}
+    for keyframe, numbers in sorted(members.items()):
+        by_visit.setdefault(recordings[keyframe], {})[keyframe] = numbers
+    there = set(by_visit) | {recordings[k] for k in candidates.tolist()}
+    if len(there) == 1:
+        (only,) = there
+        return (Visit(only, Presence.PRESENT, len(members), 0, 0, 0, 0, 0, box),)
+    own = {number: thing_points(lifted, part, see, shape) for number, part in by_visit.items()}
+    found = []
+    for number in sorted(there):
+        others = [points for other, points in sorted(own.items()) if other != number]
+        known = np.concatenate(others) if others else np.empty((0, 3))
+        known = known[np.arange(min(len(known), visit.points)) * len(known) // max(min(len(known), visit.points), 1)]
+        frames = [k for k in candidates.tolist() if recordings[k] == number]
+        counts, missed = _looked(lifted, frames, members, known, visit)
+        mine = by_visit.get(number, {})
+        presence = Presence.PRESENT if mine else _without(counts, len(known), visit)
+        if not mine and not int(counts.sum()):
+            continue
+        shown = upright_box(own[number], up, shape.trim) if mine else None
+        seen, through, occluded = (int(value) for value in counts)
+        found.append(Visit(number, presence, len(mine), len(known), seen, through, occluded, missed, shown))
+    return tuple(found)
+
+
+def _without(counts: IntArray, points: int, visit: VisitOptions) -> Presence:
+    """Of a visit that shows no sighting."""
+    if counts[THROUGH] >= max(visit.through_share * points, visit.through_to_seen * counts[SEEN], 1):
+        return Presence.ABSENT
+    return Presence.UNOBSERVED
+
+
+def _looked(
+    lifted: Sequence[LiftedKeyframe], frames: Sequence[int], members: Members, points: FloatArray, visit: VisitOptions
+) -> tuple[IntArray, int]:
+    """How many of the `points` ``[n, 3]`` are seen, seen through, occluded, and how many keyframes missed them."""
+    votes = np.zeros((len(points), 3), np.int32)
+    limits = np.array([visit.near_m, visit.near_share, visit.through_m, visit.through_share_of_depth])
+    missed = 0
+    for k in frames:
+        frame, camera = lifted[k], lifted[k].camera
+        distortion = np.array((*camera.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5], np.float64)
+        lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], np.float64)
+        before = int(votes[:, SEEN].sum())
+        pose = invert_pose(frame.world_from_camera)
+        witness(points, pose, lens, distortion, frame.grid_depth, float(frame.step), limits, votes)
+        if k not in members and int(votes[:, SEEN].sum()) - before >= visit.missed_share * max(len(points), 1):
+            missed += 1
+    through = votes[:, THROUGH] > votes[:, SEEN]
+    seen = ~through & (votes[:, SEEN] > 0)
+    occluded = ~through & ~seen & (votes[:, OCCLUDED] > 0)
+    return np.array([seen.sum(), through.sum(), occluded.sum()], np.int32), missed
+
+
+@kernel
+def witness(points, camera_from_world, lens, distortion, grid_depth, scale, limits, votes):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Adds to `votes` int32 ``[n, 3]`` whether a keyframe sees each point float64 ``[n, 3]``, sees through it, or not.
+
+    `limits`: near_m, near_share, through_m, through_share (of the point's depth); the others as in `kernels.look_up`.
+    """
+    fx, fy, cx, cy, width, height = lens
+    k1, k2, p1, p2, k3 = distortion
+    rows, columns = grid_depth.shape
+    r = camera_from_world
+    corner = np.sqrt((max(cx, width - cx) / fx) ** 2 + (max(cy, height - cy) / fy) ** 2)
+    for k in range(len(points)):
+        px, py, pz = points[k, 0], points[k, 1], points[k, 2]
+        z = r[2, 0] * px + r[2, 1] * py + r[2, 2] * pz + r[2, 3]
+        if z < 0.05:
+            continue
+        x = (r[0, 0] * px + r[0, 1] * py + r[0, 2] * pz + r[0, 3]) / z
+        y = (r[1, 0] * px + r[1, 1] * py + r[1, 2] * pz + r[1, 3]) / z
+        if abs(x) > 2 * corner or abs(y) > 2 * corner:
+            continue
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        u = fx * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + cx
+        v = fy * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) + cy
+        if u < -0.5 or v < -0.5 or u >= width - 0.5 or v >= height - 0.5:
+            continue
+        column = min(int((u + 0.5) / scale), columns - 1)
+        row = min(int((v + 0.5) / scale), rows - 1)
+        # of the cells around: a surface near the point anywhere speaks for it, farther ones have to be everywhere
+        nearest, farthest, least = 1e9, -1e9, 1e9
+        known = False
+        for b in range(max(row - 1, 0), min(row + 2, rows)):
+            for a in range(max(column - 1, 0), min(column + 2, columns)):
+                measured = grid_depth[b, a]
+                if measured > 0:
+                    away = measured - z
+                    known = True
+                    farthest = max(farthest, away)
+                    least = min(least, away)
+                    nearest = min(nearest, abs(away))
+        if not known or not grid_depth[row, column] > 0:
+            continue
+        if nearest <= limits[0] + limits[1] * z:
+            votes[k, 0] += 1
+        elif least > limits[2] + limits[3] * z:
+            votes[k, 1] += 1
+        elif farthest < 0 or grid_depth[row, column] < z:
+            votes[k, 2] += 1
