@@ -18,17 +18,11 @@ import numpy as np
 
 from semdb.geometry import invert_pose, pose_distances
 from semdb.geometry.sensor import depth_noise
+from semdb.localization.sandwich import angle_between_views, cells_of, sandwich
 from semdb.types import Float32Array, FloatArray, IntArray
 
 CAUCHY_SQUARED = 4.0  # (2 sigma)^2: where the loss leaves the parabola
 QUERY = 0  # index of the query among the images
-PARAMETERS_OF_QUERY = 9
-# Of the covariance (see `_covariance`), fitted on half of the rendered rooms with keyframes near and far
-CELL = 0.152  # over the focal length: 80 pixels of 525; within it errors are alike
-SHARED_FACTOR = 1.3  # by which errors that cells have in common exceed what single cells show; and
-SHARED_PER_RAD = 19.0  # so much more per radian between the rays from which query and keyframe see a point
-SHARED_VARIANCE = 0.025  # of the assumed variance, believed whatever the residuals
-MOST_CORRECTION = 4.0  # of the scatter of few cells
 EVIDENCE_ROUNDS = 30
 FIRST_ITERATIONS = 4  # before the variances of the priors are known
 LEAST_GAIN = 1e-3  # of the cost; smaller ones move the pose by less than a tenth of its error
@@ -339,56 +333,26 @@ def _evident_sigma(
 
 
 def _covariance(solver: _Solver, blocks: _Blocks, camera_from_world: FloatArray, shown: FloatArray) -> FloatArray:
-    """Covariance of the query's pose in the world, with all else marginalised out.
-
-    The sandwich of Huber (1967) and White (1982): how large the errors are is read off the residuals, not taken from
-    the noise that the weights assume. Neighbours err alike (one surface is slanted, one corner of the lens is bent), so
-    residuals add up within cells of the query's image before they are squared (Liang and Zeger, Biometrika 73, 1986).
-    What cells have in common is not seen so; it grows with the angle between the views: `SHARED_FACTOR`. The least
-    sigma of a prior keeps the numbers at bay and is not believed: of its variance the share `shown` ``[9c]`` counts.
-    A step (t, w) of the camera moves its centre by -R t and turns it by -R w, R being world_from_camera.
-    """
+    """Covariance of the query's pose in the world, with all else marginalised out (see `sandwich`)."""
     from semdb.localization.bundle_kernels import pulls_of_groups
 
     problem = solver.problem
     reduced, _ = solver.reduced(blocks, 0.0)
-    prior = solver.information.reshape(-1)
-    group = _cells_of_points(problem)
-    groups = int(group.max()) + 1
-    pulls = np.zeros((groups, len(reduced)))
+    seen = problem.observed_image == QUERY
+    pixels = np.zeros((len(problem.points), 2))
+    pixels[problem.observed_point[seen]] = problem.xy[seen]
+    group = cells_of(pixels)
+    pulls = np.zeros((int(group.max()) + 1, len(reduced)))
     pulls_of_groups(
         blocks.own_gradients, blocks.coupling, blocks.points, blocks.point_gradients, solver.first,
         problem.observed_image, group, pulls,
     )  # fmt: skip
-    factor = SHARED_FACTOR + SHARED_PER_RAD * _angle_between_views(problem, camera_from_world)
-    scatter = pulls.T @ pulls * (factor * min(groups / max(groups - PARAMETERS_OF_QUERY, 1), MOST_CORRECTION))
-    scatter += SHARED_VARIANCE * reduced
-    scatter[np.diag_indices_from(scatter)] += prior * (shown - SHARED_VARIANCE)
-    inverse = np.linalg.inv(reduced)
-    in_camera = (inverse @ scatter @ inverse)[:6, :6]
-    turn = np.zeros((6, 6))
-    turn[:3, :3] = turn[3:, 3:] = -camera_from_world[:3, :3].T
-    covariance: FloatArray = turn @ in_camera @ turn.T
-    return (covariance + covariance.T) / 2
-
-
-def _angle_between_views(problem: BundleProblem, camera_from_world: FloatArray) -> float:
-    """The median angle in radians between the rays from the query and from a keyframe to a point that both see."""
     poses = np.concatenate([camera_from_world[None], problem.keyframe_from_world])
     centres = -np.einsum("cji,cj->ci", poses[:, :3, :3], poses[:, :3, 3])
-    seen = problem.observed_image != QUERY
-    points = problem.points[problem.observed_point[seen]]
-    one, two = points - centres[QUERY], points - centres[problem.observed_image[seen]]
-    crossed = np.linalg.norm(np.cross(one, two), axis=1)
-    return float(np.median(np.arctan2(crossed, (one * two).sum(axis=1)))) if len(points) else 0.0
-
-
-def _cells_of_points(problem: BundleProblem) -> IntArray:
-    """The cell ``[m]`` of the query's image in which each point was seen, numbered from 0."""
-    seen = np.flatnonzero(problem.observed_image == QUERY)
-    cell = np.zeros((len(problem.points), 2))
-    cell[problem.observed_point[seen]] = np.floor(problem.xy[seen] / CELL)
-    return np.unique(cell @ [1000.0, 1.0], return_inverse=True)[1].astype(np.int32)
+    theirs = np.flatnonzero(~seen)
+    points = problem.points[problem.observed_point[theirs]]
+    angle = angle_between_views(centres[QUERY], centres[problem.observed_image[theirs]], points)
+    return sandwich(reduced, pulls, solver.information.reshape(-1), shown, angle, camera_from_world)
 
 
 def pixel_sigma(size: Float32Array, focal: float, base_px: float = 1.0) -> FloatArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -71,6 +71,8 @@ def adjust_components(
     readout_s, residual, noise_px = 0.0, options.adjustment.residual_turn_rad, (1.0, 1.0)
     steps = len(options.adjustment.radii_px)
     for done, radius in enumerate(options.adjustment.radii_px):
+        rounds = options.adjustment.noise_rounds if done + 1 == steps else 1  # rough first
+        adjustment = replace(options.adjustment, noise_rounds=rounds)
         rates = rates_at(poses)
         keyframes.move(poses)
         far = [] if far_pairs is None else far_pairs(solution.components)
@@ -85,7 +87,7 @@ def adjust_components(
             held = np.bincount(shared.image, minlength=size) < options.adjustment.least_observations
             anchor = poses[members[0]].copy()
             held[0] = True
-            found = adjust_keyframes(shared, poses[members], held, rates[members], options.adjustment)
+            found = adjust_keyframes(shared, poses[members], held, rates[members], adjustment)
             poses[members] = anchor @ invert_pose(found.poses[0]) @ found.poses
             poses[members[0]] = anchor  # exactly
             turns[members] = found.turn

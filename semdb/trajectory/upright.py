@@ -18,7 +18,7 @@ from semdb.types import FloatArray
 
 STRIDE = 3  # cells of a thinned depth between the points that a normal is of
 NORMALS = 400  # of each keyframe
-SEARCHED = 3000  # of all, while directions are tried
+SEARCHED = 1500  # of all, while directions are tried
 BEND = 0.97  # cosine that the normals of neighbouring cells of a plane have at least
 FARTHEST_DEG = 40.0  # of up from the cameras' mean up
 WIDTH_DEG = 3.0  # to which surfaces are level or plumb
@@ -121,9 +121,10 @@ def _support(normals: FloatArray, directions: FloatArray) -> FloatArray:
     """How many of `normals` are level or plumb to each of `directions` ``[n]``."""
     along = np.abs(normals @ directions.T)
     width = np.radians(WIDTH_DEG)
-    off_level = np.arccos(np.clip(along, 0, 1)) / width  # of one near to 1 to a thousandth: enough to count
-    off_plumb = np.arcsin(np.clip(along, 0, 1)) / width
-    return np.asarray((np.exp(-0.5 * off_level**2) + np.exp(-0.5 * off_plumb**2)).sum(axis=0))
+    off_plumb = np.arcsin(np.minimum(along, 1.0))
+    off_level = np.pi / 2 - off_plumb
+    off = np.minimum(off_plumb, off_level) / width  # of both, the other is nothing
+    return np.asarray(np.exp(-0.5 * off * off).sum(axis=0))
 
 
 def _settled(normals: FloatArray, up: FloatArray) -> FloatArray:
