@@ -152,6 +152,7 @@ def print_summary(found: RecordedTrajectory, recording: Recording, seconds: floa
     lines = [
         ("recording", f"{recording.name} ({recording.format}) in {recording.path}"),
         ("frames", f"{told['frames']}, tracked {told['tracked']}, of these found again {told['relocalized']}"),
+        *([("", f"{told['laid']} by surfaces, which keypoints did not carry")] if told["laid"] else []),
         ("without pose", f"{without}: lost {told['lost']}, left out {told['left_out']}" if without else "none"),
         *(("", f"frame {gone['frame']}: {gone['reason']}") for gone in told["without_pose"][:REASONS_SHOWN]),
         *([("", f"and {without - REASONS_SHOWN} more")] if without > REASONS_SHOWN else []),

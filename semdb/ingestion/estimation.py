@@ -15,6 +15,7 @@ from semdb.database.store import Store
 from semdb.errors import RecordingError, UsageError
 from semdb.recordings.base import FrameEntry, Recording
 from semdb.trajectory.carried import carried_edges
+from semdb.trajectory.odometry import FrameState
 from semdb.trajectory.recording import RecordedTrajectory, find_recorded
 from semdb.types import FloatArray
 
@@ -137,6 +138,9 @@ def told(found: RecordedTrajectory) -> list[str]:
         f"{len(trajectory.used)} of {len(trajectory.frames)} frames have an estimated pose, "
         f"{len(trajectory.closures())} loop closures count; the world has its origin at the first keyframe, {up}"
     ]
+    laid = trajectory.count(FrameState.LAID)
+    if laid:
+        lines.append(f"{laid} frames, which keypoints did not carry, were tracked by surfaces")
     others = trajectory.pieces[1:]
     if others:
         frames = sum(piece.frames for piece in others)

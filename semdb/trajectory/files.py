@@ -44,6 +44,7 @@ def summary(found: RecordedTrajectory, seconds: float) -> dict[str, Any]:
         "frames": frames,
         "tracked": len(placed),
         "used": len(used),
+        "laid": trajectory.count(FrameState.LAID),
         "relocalized": trajectory.count(FrameState.RELOCALIZED),
         "lost": trajectory.count(FrameState.LOST),
         "left_out": trajectory.count(FrameState.LEFT_OUT),

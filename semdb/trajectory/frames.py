@@ -13,6 +13,7 @@ from semdb.perception.lifting import lift
 from semdb.perception.protocols import FeatureExtractor
 from semdb.trajectory.depth_views import DepthView, depth_view
 from semdb.trajectory.options import FrameOptions
+from semdb.trajectory.surface_views import SurfaceView, surface_view
 from semdb.types import Camera, Features, Float32Array, ImageArray, Keypoints
 
 SHARP_RANK = 250
@@ -30,11 +31,16 @@ class SeenFrame:
     view: View
     sharpness: float  # falls as the image gets blurred
     depth: DepthView | None
+    whole_depth: Float32Array | None = None  # [H, W]
 
     @property
     def with_depth(self) -> int:
         """How many keypoints have a 3D point."""
         return int(np.count_nonzero(np.isfinite(self.view.points[:, 2])))
+
+    def surface_view(self) -> SurfaceView | None:
+        """What its surfaces are made of; None without depth."""
+        return surface_view(self.view.camera, self.whole_depth, self.view.grey)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +68,7 @@ def see(
     points = lift(camera, depth, found.xy)
     keypoints = Keypoints(found, np.full(len(found), -1, np.int32), points)
     view = make_view(camera, keypoints, (), ClassNumbers(), grey=grey)
-    return SeenFrame(position, time_s, image, view, _sharpness(found), depth_view(camera, depth))
+    return SeenFrame(position, time_s, image, view, _sharpness(found), depth_view(camera, depth), depth)
 
 
 def _sharpness(features: Features) -> float:

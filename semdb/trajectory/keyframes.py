@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Collection
 from dataclasses import dataclass
 
@@ -9,10 +10,14 @@ import numpy as np
 
 from semdb.geometry import invert_pose, pose_distances, transform_points
 from semdb.geometry.volumes import Volume
+from semdb.localization.surface_alignment import PlacedSurfaces, place
+from semdb.localization.surfaces import Surfaces
 from semdb.localization.views import KeyframeView, View
 from semdb.trajectory.depth_views import DepthView
+from semdb.trajectory.surface_views import SurfaceView
 from semdb.types import BoolArray, Float32Array, FloatArray
 
+SURFACES_KEPT = 12  # keyframes; about 2 MiB each
 SAMPLES = 64  # points by which the common view of two frames is judged
 
 
@@ -31,6 +36,7 @@ class Keyframe:
     vector: Float32Array  # [d] place vector, L2-normalised
     sample: FloatArray  # [s, 3] some of its points, camera frame
     depth: DepthView | None = None
+    surface: SurfaceView | None = None
 
 
 class Keyframes:
@@ -39,6 +45,7 @@ class Keyframes:
     def __init__(self) -> None:
         self.all: list[Keyframe] = []
         self.poses: list[FloatArray] = []
+        self._surfaces: OrderedDict[int, Surfaces | None] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self.all)
@@ -56,6 +63,17 @@ class Keyframes:
         view = self.all[number].view
         where = self.poses[number] if pose is None else pose
         return KeyframeView(number, view, where, invert_pose(where), transform_points(where, view.points))
+
+    def surfaces(self, number: int) -> PlacedSurfaces | None:
+        """The surfaces of a keyframe at its pose, the latest kept in memory; None of one without depth."""
+        if number not in self._surfaces:
+            view = self.all[number].surface
+            self._surfaces[number] = None if view is None else view.surfaces()
+        self._surfaces.move_to_end(number)
+        while len(self._surfaces) > SURFACES_KEPT:
+            self._surfaces.popitem(last=False)
+        found = self._surfaces[number]
+        return None if found is None else place(number, found, self.poses[number])
 
     def in_piece(self, piece: int) -> list[int]:
         return [keyframe.number for keyframe in self.all if keyframe.piece == piece]

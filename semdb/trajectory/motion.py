@@ -39,15 +39,16 @@ class Motion:
         """How long ago the last pose was; infinite without one."""
         return time_s - self._poses[-1][0] if self._poses else np.inf
 
-    def predict(self, time_s: float) -> FloatArray | None:
-        """The pose ``[4, 4]`` at `time_s`; None where nothing is known, or for too long."""
-        if self.gap_s(time_s) > self._longest_s:
+    def predict(self, time_s: float, longest_s: float | None = None) -> FloatArray | None:
+        """The pose ``[4, 4]`` at `time_s`; None where nothing is known, or for more than `longest_s`, or the usual."""
+        longest_s = self._longest_s if longest_s is None else longest_s
+        if self.gap_s(time_s) > longest_s:
             return None
         now, pose = self._poses[-1]
         if len(self._poses) < 2:
             return pose
         before, older = self._poses[0]
-        if not 0 < now - before <= self._longest_s:
+        if not 0 < now - before <= longest_s:
             return pose
         share = (time_s - now) / (now - before)
         step = invert_pose(older) @ pose

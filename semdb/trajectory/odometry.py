@@ -8,7 +8,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from semdb.geometry import transform_points
+from semdb.geometry import pose_distances, transform_points
 from semdb.geometry.volumes import Volume, common_views
 from semdb.localization.views import KeyframeView
 from semdb.perception.protocols import Encoder
@@ -16,6 +16,7 @@ from semdb.trajectory.depth_views import depth_agreement
 from semdb.trajectory.edges import Edge, EdgeKind
 from semdb.trajectory.frames import EmptyFrame, SeenFrame
 from semdb.trajectory.keyframes import Keyframe, Keyframes, sample_of, with_points_only
+from semdb.trajectory.laying import lay
 from semdb.trajectory.motion import Motion, turn_rates
 from semdb.trajectory.observations import FrameObservations, observations_of
 from semdb.trajectory.options import TrajectoryOptions
@@ -39,6 +40,7 @@ class FrameState(StrEnum):
     """What became of a frame."""
 
     TRACKED = "tracked"
+    LAID = "laid"  # on surfaces of keyframes, where keypoints did not place it
     RELOCALIZED = "relocalized"  # lost, and found again among all keyframes
     LOST = "lost"
     LEFT_OUT = "left out"  # it shows too little, or cannot be read
@@ -90,6 +92,10 @@ class Odometry:
     def _place(self, frame: SeenFrame) -> FrameTrack:
         placed = self._by_tracking(frame)
         state = FrameState.TRACKED
+        if placed is None:
+            placed, state = self._by_surfaces(frame), FrameState.LAID
+        elif placed.estimate.inliers < self.options.tracking.few_inliers:
+            placed = self._laid_from(frame, [placed.pose], self._piece) or placed
         if placed is None:
             placed, state = self.relocalize(frame), FrameState.RELOCALIZED
         if placed is None:
@@ -143,6 +149,37 @@ class Odometry:
         if moved_too_far(placed.pose, last, self._motion.gap_s(frame.time_s), self.options):
             return found_anywhere(frame.view, views, self.options)
         return placed
+
+    def _by_surfaces(self, frame: SeenFrame) -> Placed | None:
+        """Lays a frame on surfaces from where the camera was, and from where it should be by now."""
+        last = self._motion.last
+        if last is None or self._lost > self.options.tracking.patience:
+            return None
+        predicted = self._motion.predict(frame.time_s, self.options.tracking.surfaces_gap_s)
+        starts = [last] if predicted is None else [predicted, last]
+        placed = self._laid_from(frame, starts, self._piece)
+        if placed is None or moved_too_far(placed.pose, last, self._motion.gap_s(frame.time_s), self.options):
+            return None
+        return placed
+
+    def _laid_from(self, frame: SeenFrame, starts: list[FloatArray], piece: int) -> Placed | None:
+        near = self.keyframes.nearest(starts[0], self.keyframes.in_piece(piece), self.options.tracking.surfaces)
+        return lay(frame, self.keyframes, near, starts, self.options)
+
+    def lay_beside(self, frame: SeenFrame, row: int) -> Placed | None:
+        """Lays a lost frame, that of the track `row`, on surfaces from where the frames before and after it are."""
+        for step in (-1, 1):
+            other = row + step
+            while 0 <= other < len(self.tracks) and self.tracks[other].reference < 0:
+                other += step
+            if not 0 <= other < len(self.tracks) or abs(other - row) > self.options.tracking.patience:
+                continue
+            track = self.tracks[other]
+            start = self.keyframes.poses[track.reference] @ track.reference_from_frame
+            placed = self._laid_from(frame, [start], self.keyframes.all[track.reference].piece)
+            if placed is not None:
+                return placed
+        return None
 
     def _holds(self, frame: SeenFrame, placed: Placed | None) -> bool:
         return holds(placed, None if placed is None else self._agreement(frame, placed), self.options)
@@ -213,13 +250,16 @@ class Odometry:
 
     def _is_keyframe(self, frame: SeenFrame, placed: Placed) -> bool:
         options = self.options.keyframes
-        if frame.with_depth < options.least_points:
+        if frame.with_depth < options.least_points and not placed.laid:
             return False
         sample = transform_points(placed.pose, sample_of(frame.view))
         volume = Volume(frame.view.camera, placed.pose, sample)
         near = self.keyframes.nearest(placed.pose, self.keyframes.in_piece(self._piece), COMPARED)
         common = max(common_views(volume, [self.keyframes.volume(n) for n in near]), default=0.0)
         if common < options.urgent_view or placed.estimate.inliers < options.urgent_inliers:
+            return True
+        few = placed.laid or placed.estimate.inliers < self.options.tracking.many_inliers
+        if few and near and float(pose_distances(placed.pose, self.keyframes.poses[near[0]][None])[0]) > options.far:
             return True
         if common >= options.common_view:
             return False
@@ -231,9 +271,9 @@ class Odometry:
         pose = np.eye(4) if placed is None else placed.pose
         view = with_points_only(frame.view)
         vector = self.encoder.encode(frame.image)
-        sample = sample_of(view)
-        keyframe = Keyframe(number, frame.position, frame.time_s, self._piece, view, vector, sample, frame.depth)
-        self.keyframes.add(keyframe, pose)
+        sample, surface = sample_of(view), frame.surface_view()
+        at = number, frame.position, frame.time_s, self._piece
+        self.keyframes.add(Keyframe(*at, view, vector, sample, frame.depth, surface), pose)
         self.odometry_poses.append(pose)
         self._since_keyframe = 0
         if placed is not None:
@@ -256,7 +296,7 @@ def track_of(frame: SeenFrame, placed: Placed, state: FrameState) -> FrameTrack:
         reference=reference.keyframe_id,
         reference_from_frame=reference.camera_from_world @ placed.pose,
         covariance=local_covariance(placed),
-        observations=observations_of(frame.view, placed),
+        observations=None if placed.laid else observations_of(frame.view, placed),
     )
 
 
@@ -279,7 +319,7 @@ def edges_to(number: int, placed: Placed) -> tuple[list[Edge], FloatArray]:
     covariance = local_covariance(placed)
     pairs = placed.estimate.per_keyframe
     order = sorted(range(len(pairs)), key=lambda slot: -pairs[slot])
-    chosen = [slot for slot in order if pairs[slot] >= EDGE_PAIRS][:2] or order[:1]
+    chosen = [slot for slot in order if pairs[slot] >= (1 if placed.laid else EDGE_PAIRS)][:2] or order[:1]
     information = np.asarray(np.linalg.inv(covariance * len(chosen)), np.float64)
     edges = []
     for slot in chosen:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from semdb.localization.bundle import MotionPrior
 from semdb.localization.matching import MatchingOptions
 from semdb.localization.pose_options import PoseOptions
+from semdb.localization.surface_step import SurfaceVerdictOptions
 from semdb.localization.verdict import VerdictOptions
 from semdb.threads import cores
 from semdb.trajectory.consistency import ConsistencyOptions
@@ -38,9 +39,13 @@ class TrackingOptions:
     predicted_share: float = 0.5
     least_inliers: int = 25
     many_inliers: int = 120
+    few_inliers: int = 70  # with fewer, surfaces have a say, too
     least_agreement: float = 0.6
     least_spread: float = 0.19
     most_sigma_m: float = 0.05
+    most_sigma_deg: float = 2.0  # of a frame laid on surfaces
+    surfaces_gap_s: float = 3.0  # for so long the motion says where to begin
+    surfaces: int = 4  # keyframes on whose surfaces a frame is laid that keypoints do not carry
     patience: int = 3  # frames that may be lost before a new piece begins
     relocalize: int = 6  # keyframes that a lost frame is compared with
     jump_m: float = 0.4
@@ -60,6 +65,7 @@ class KeyframeOptions:
     sharp: float = 0.6
     least_points: int = 80  # with depth
     urgent_inliers: int = 70
+    far: float = 0.4  # (`pose_distances`) from all others, where few keypoints agree: what is seen of surfaces changes
     most_frames: int = 30  # between two keyframes of a camera that moves
 
 
@@ -116,6 +122,11 @@ class AdjustmentOptions:
     max_iterations: int = 20
 
 
+def _where_motion_leads() -> SurfaceVerdictOptions:
+    """Fewer keypoints have to vouch than for a query: it is known where the camera was; more has to fit."""
+    return SurfaceVerdictOptions(least_near=0.7, least_support=4)
+
+
 @dataclass(frozen=True, slots=True)
 class TrajectoryOptions:
     """All of it. `close_loops` and `adjust` can be switched off, to see what they bring."""
@@ -128,6 +139,7 @@ class TrajectoryOptions:
     consistency: ConsistencyOptions = field(default_factory=ConsistencyOptions)
     adjustment: AdjustmentOptions = field(default_factory=AdjustmentOptions)
     matching: MatchingOptions = field(default_factory=MatchingOptions)
+    surfaces: SurfaceVerdictOptions = field(default_factory=_where_motion_leads)
     motion: MotionPrior = field(default_factory=MotionPrior)
     close_loops: bool = True
     adjust: bool = True

@@ -68,7 +68,8 @@ def _rows(
         rows[r, RESIDUAL] = residual
         for j in range(3):
             by_point[r, j] = a * rotation[c, 0, j] + b * rotation[c, 1, j] + d * rotation[c, 2, j]
-    return cauchy * np.log(growth)
+    cost: float = cauchy * np.log(growth)
+    return cost
 
 
 @kernel(fastmath=FAST)

@@ -113,9 +113,12 @@ def _look_again(
     lost = [row for row, track in enumerate(odometry.tracks) if track.state is FrameState.LOST]
     for done, row in enumerate(lost, start=1):
         frame = describe(odometry.tracks[row].position)
-        placed = odometry.relocalize(frame) if isinstance(frame, SeenFrame) else None
-        if placed is not None and isinstance(frame, SeenFrame):
-            odometry.tracks[row] = track_of(frame, placed, FrameState.RELOCALIZED)
+        if isinstance(frame, SeenFrame):
+            placed, state = odometry.relocalize(frame), FrameState.RELOCALIZED
+            if placed is None:
+                placed, state = odometry.lay_beside(frame, row), FrameState.LAID
+            if placed is not None:
+                odometry.tracks[row] = track_of(frame, placed, state)
         _tell(progress, "looking for lost frames", done, len(lost))
 
 

@@ -37,6 +37,7 @@ class Placed:
 
     estimate: PoseEstimate
     keyframes: tuple[KeyframeView, ...]  # in the order of the slots of the pairs
+    laid: bool = False  # on surfaces, which its pairs alone would not place
 
     @property
     def pose(self) -> FloatArray:
