@@ -32,8 +32,8 @@ $(VENV)/.stamp-base: pyproject.toml $(LOCK) | $(BIN)/python
 	@touch $@
 
 $(VENV)/.stamp-dev: pyproject.toml $(LOCK) | $(BIN)/python
-	@echo "installing semdb with the torch (several GB), worker and development extras into $(VENV)"
-	@$(PIP) install --constraint $(LOCK) --editable '.[torch,worker,dev]'
+	@echo "installing semdb with the torch (several GB), worker, serve and development extras into $(VENV)"
+	@$(PIP) install --constraint $(LOCK) --editable '.[torch,worker,serve,dev]'
 	@touch $(VENV)/.stamp-base $@
 
 demo: $(VENV)/.stamp-base

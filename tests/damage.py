@@ -129,7 +129,13 @@ def damages(thick: bool) -> Iterator[Damage]:
                         yield Damage(table.name, column.name, what, value, every=True)
 
 
-_THIN = {"queries": 0, "keypoints": 2, "refinements": 2}  # so many of the first of `_kinds`
+_THIN = {
+    "access_tokens": 0,
+    "service_jobs": 0,
+    "queries": 0,
+    "keypoints": 2,
+    "refinements": 2,
+}  # so many of the first of `_kinds`
 _NUMBERS: list[tuple[str, Any]] = [
     ("text", "rubbish"),
     ("infinite", float("inf")),

@@ -103,6 +103,13 @@ class Localizing(Base):
         )
         return list(answers) if many else next(answers)
 
+    def prepare(self, map: str | None = None) -> None:
+        """Loads the networks and the index that `localize` needs for a map, or all, unless they are there.
+
+        Raises what `localize` raises.
+        """
+        self._here.maps().asked(map, "index")
+
     def localize_each(
         self,
         images: Sequence[Image],

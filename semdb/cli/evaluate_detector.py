@@ -24,9 +24,10 @@ def command(
     import json
     from dataclasses import asdict
 
-    from semdb.cli.output import print_lines, print_table, to_jsonable
+    from semdb.cli.output import print_lines, print_table
     from semdb.cli.progress import Progress, say
     from semdb.cli.train import classes_of
+    from semdb.jsonable import to_jsonable
     from semdb.perception.detectors import load_detector
     from semdb.training.coco import load_coco
     from semdb.training.evaluation import LEAST_SCORE, MEASURES, PAPER, evaluate_detector

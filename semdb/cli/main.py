@@ -48,6 +48,8 @@ COMMANDS: dict[str, str] = {
     "train": "semdb.cli.train",
     "evaluate-detector": "semdb.cli.evaluate_detector",
     "synth": "semdb.cli.synth",
+    "serve": "semdb.cli.serve",
+    "token": "semdb.cli.token",
     "doctor": "semdb.cli.doctor",
 }
 

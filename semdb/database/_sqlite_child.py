@@ -67,7 +67,8 @@ def _run(request: dict[str, Any]) -> None:
     connection.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
     connection.execute(f"PRAGMA hard_heap_limit = {request['memory'] // 2}")
     connection.execute("PRAGMA query_only = ON")
-    connection.set_authorizer(_authorize)
+    hidden = frozenset(request["hidden"])
+    connection.set_authorizer(lambda *asked: _authorize(hidden, *asked))
     connection.set_progress_handler(lambda: int(time.monotonic() > deadline), 10_000)
     cursor = connection.execute(request["sql"])
     if cursor.description is None:
@@ -86,8 +87,10 @@ def _run(request: dict[str, Any]) -> None:
         _send(("rows", rows))
 
 
-def _authorize(action: int, _first: str | None, second: str | None, *_: str | None) -> int:
+def _authorize(hidden: frozenset[str], action: int, first: str | None, second: str | None, *_: str | None) -> int:
     if action not in _ALLOWED_ACTIONS:
+        return sqlite3.SQLITE_DENY
+    if action == sqlite3.SQLITE_READ and (first or "").lower() in hidden:
         return sqlite3.SQLITE_DENY
     if action == sqlite3.SQLITE_FUNCTION and (second or "").lower() in _DENIED_FUNCTIONS:
         return sqlite3.SQLITE_DENY

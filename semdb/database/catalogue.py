@@ -8,6 +8,7 @@ from collections.abc import Generator
 
 from semdb.database.readonly import Row, file_of, run_readonly
 from semdb.database.readonly_sqlite import read_own
+from semdb.database.statement import HIDDEN
 from semdb.errors import DatabaseError, SemdbError
 from semdb.settings import Settings
 
@@ -30,7 +31,8 @@ def tables_and_columns(settings: Settings) -> dict[str, tuple[str, ...]]:
     file = file_of(settings)
     found: dict[str, tuple[str, ...]] = {}
     for table, column in run_readonly(settings, _SERVER)[1] if file is None else read_own(file, _FILE):
-        found[str(table)] = (*found.get(str(table), ()), str(column))
+        if str(table).lower() not in HIDDEN:
+            found[str(table)] = (*found.get(str(table), ()), str(column))
     return found
 
 

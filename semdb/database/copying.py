@@ -18,6 +18,7 @@ from semdb.database.copying_landmarks import copy_landmarks
 from semdb.database.ids import new_id
 from semdb.database.records import ChangeKind
 from semdb.database.refinements import map_state
+from semdb.database.statement import HIDDEN
 from semdb.errors import DatabaseError, UsageError
 
 SHARED = {"models": "digest", "cameras": "digest", "categories": "name"}
@@ -100,6 +101,8 @@ def _hanging_from(parent: str) -> list[Table]:
     found = []
     for table in tables.metadata.sorted_tables:
         parents = {key.column.table.name for column in table.columns for key in column.foreign_keys}
+        if table.name in HIDDEN:  # what is of this database alone
+            continue
         if parent in parents and not parents & set(below):
             found.append(table)
     return found

@@ -15,7 +15,7 @@ from typing import Any
 
 from semdb.database import readonly_sqlite, sqlite_file
 from semdb.database.engine import make_engine, parse_url, safe_url, sqlite_path
-from semdb.database.statement import check_limits, check_reads
+from semdb.database.statement import check_hidden, check_limits, check_reads
 from semdb.errors import SchemaError, UsageError
 from semdb.settings import Settings
 from semdb.shown import number
@@ -42,6 +42,7 @@ def run_readonly(settings: Settings, sql: str) -> tuple[tuple[str, ...], Generat
 def _check_statement(sql: str, *, server: bool) -> None:
     check_reads(sql)
     if server:
+        check_hidden(sql)
         check_limits(sql)
 
 

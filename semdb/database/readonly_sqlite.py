@@ -24,6 +24,7 @@ from typing import Any
 
 from semdb.database import sqlite_file
 from semdb.database.sqlite_file import Opening
+from semdb.database.statement import HIDDEN
 from semdb.errors import DatabaseError, SemdbError, UsageError
 
 Row = tuple[Any, ...]
@@ -49,6 +50,7 @@ def rows_of(path: Path, sql: str, limit_s: float, too_slow: str) -> Generator[Ro
         request = {
             "uri": f"{path.absolute().as_uri()}?{query}",
             "sql": sql,
+            "hidden": [*HIDDEN, "sqlite_dbpage"],
             "seconds": limit_s,
             "grace": GRACE_S + _SELF_DESTRUCTION_S,
             "memory": MEMORY,

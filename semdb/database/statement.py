@@ -7,11 +7,14 @@ may only read may do all the same: locks that make writers wait, and hints that 
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Iterator
 
 from semdb.errors import UsageError
 
 FIRST_WORDS = ("SELECT", "WITH", "EXPLAIN", "VALUES", "SHOW", "DESCRIBE", "DESC", "TABLE")
+HIDDEN = ("access_tokens", "service_jobs")
+"""Tables that nobody reads with a statement of his own."""
 _COMMENT = re.compile(r"\s+|--[^\n]*(?:\n|$)|#[^\n]*(?:\n|$)|/\*(?!M?!).*?\*/", re.DOTALL)
 # In this order; the mode of our sessions knows escapes with a backslash, and no names in double quotes.
 _TOKEN = re.compile(
@@ -38,6 +41,17 @@ def check_reads(sql: str) -> None:
     if word is None or word.group().upper() not in FIRST_WORDS:
         shown = sql[place : place + 40]
         raise UsageError(f"only queries can be run here ({', '.join(FIRST_WORDS[:2])} ...), not {shown!r}")
+
+
+def check_hidden(sql: str) -> None:
+    """Raises UsageError for a statement for a server that names a hidden table, in whatever quotes and letters.
+
+    Without its name no SELECT reaches it: nothing in one makes names of texts.
+    """
+    plain = unicodedata.normalize("NFKC", sql).casefold()
+    for name in HIDDEN:
+        if name in plain:
+            raise UsageError(f"{name} is not shown here")
 
 
 def check_limits(sql: str) -> None:

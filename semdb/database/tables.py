@@ -491,3 +491,31 @@ landmark_merges = _table(
     _ref("map_id", "maps.id", index=True),
     Column("merged_into", Id, nullable=False),
 )
+
+access_tokens = _table(  # never shown to those who ask with SQL
+    "access_tokens",
+    _id(),
+    Column("name", Name(NAME_LENGTH), nullable=False),
+    Column("role", String(16), nullable=False),
+    _ref("map_id", "maps.id", nullable=True, index=True),
+    Column("hash", String(64), nullable=False, unique=True),
+    _time("created_at"),
+    Column("expires_at", _Moment),
+    Column("revoked_at", _Moment),
+)
+
+service_jobs = _table(  # nor is this
+    "service_jobs",
+    _id(),
+    Column("map", Name(NAME_LENGTH), nullable=False),
+    Column("who", String(64), nullable=False),
+    Column("state", String(16), nullable=False),
+    Column("request", LongText, nullable=False),
+    Column("result", LongText, nullable=False),
+    Column("error", Words),
+    Column("attempts", Integer, nullable=False),
+    _time("created_at"),
+    Column("finished_at", _Moment),
+    Column("lease_until", _Moment),
+    Index(None, "state", "id"),
+)

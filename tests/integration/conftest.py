@@ -54,10 +54,15 @@ def frames(room: Path) -> list[Frame]:
 @pytest.fixture
 def networks(tmp_path: Path) -> dict[str, str]:
     """A detector that always sees a chair, and an encoder: for images without masks of their own."""
+    return constant_networks(tmp_path)
+
+
+def constant_networks(folder: Path) -> dict[str, str]:
+    """The same, in a folder."""
     masks = np.zeros((1, 1, 240, 320), np.float32)
     masks[:, :, 40:200, 60:260] = 1
     detector = write_constant_model(
-        tmp_path / "mask_rcnn.onnx",
+        folder / "mask_rcnn.onnx",
         {
             "boxes": np.array([[60, 40, 259, 199]], np.float32),
             "labels": np.array([62], np.int64),
@@ -65,5 +70,5 @@ def networks(tmp_path: Path) -> dict[str, str]:
             "masks": masks,
         },
     )
-    encoder = write_mean_embedding_model(tmp_path / "places.onnx")
+    encoder = write_mean_embedding_model(folder / "places.onnx")
     return {"detector": f"onnx:{detector}", "encoder": f"onnx:{encoder}"}

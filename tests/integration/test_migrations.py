@@ -14,7 +14,7 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import Engine, inspect, text
 
 import semdb.migrations
-from semdb.database import schema
+from semdb.database import schema, tokens
 from semdb.database.engine import make_engine
 from semdb.database.landmark_rows import load_gravity
 from semdb.database.links import list_links
@@ -199,3 +199,21 @@ def test_landmarks_of_before_get_visits(engine: Engine, empty_url: str) -> None:
         assert len(stored_landmarks(store, map_id)) == 7
     with engine.connect() as connection:
         assert connection.execute(text("SELECT COUNT(*) FROM landmark_visit_list")).scalar() == 7
+
+
+def test_a_database_of_before_gets_tokens(engine: Engine, empty_url: str) -> None:
+    schema.upgrade(engine)
+    with open_store(empty_url) as store:
+        map_id, _, ids = fill(store)
+    schema.downgrade(engine, "0010")
+    assert "access_tokens" not in inspect(engine).get_table_names()
+    schema.upgrade(engine)
+    with open_store(empty_url) as store:
+        for keyframe, index in zip(store.load_keyframes(ids), FRAMES, strict=True):
+            assert_same(keyframe, description(index), index)
+        _, secret = tokens.make_token(engine, "robot", "localize", map_id)
+        found, _ = tokens.find_token(engine, secret)
+        assert (found.role, found.map_id) == ("localize", map_id)
+        assert tokens.find_token(engine, secret.lower()) == (None, True)
+        store.delete_map(map_id)
+        assert tokens.find_token(engine, secret) == (None, False)

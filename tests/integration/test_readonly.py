@@ -18,6 +18,7 @@ from semdb.database.catalogue import ask, tables_and_columns
 from semdb.database.engine import make_engine
 from semdb.database.readonly import run_readonly
 from semdb.database.readonly_server import excess_rights
+from semdb.database.statement import HIDDEN
 from semdb.database.store import Store, open_store
 from semdb.database.tables import metadata
 from semdb.errors import DatabaseError, SchemaError, UsageError
@@ -221,9 +222,14 @@ def test_the_command_that_the_error_names_makes_a_reader(database_server: TestSe
         done = semdb("sql", "SELECT 1 AS one", url=server_url, SEMDB_READER_URL=reader)
         assert done.stdout == "one\n---\n  1\n"
         known = tables_and_columns(Settings(database_url=server_url, reader_url=reader))
-        for table in metadata.tables.values():
+        shown = [table for table in metadata.tables.values() if table.name not in HIDDEN]
+        assert "access_tokens" not in known
+        for table in shown:
             assert known[table.name] == tuple(column.name for column in table.columns)
         assert "category" in known["keyframe_objects"]
+        for name in ("access_tokens", "`access_tokens`", "ACCESS_TOKENS", "access_to\u212aens"):
+            with pytest.raises(UsageError, match="access_tokens is not shown here"):
+                run_readonly(Settings(database_url=server_url, reader_url=reader), f"SELECT hash FROM {name}")
     finally:
         database_server.execute(f"DROP USER IF EXISTS '{accounts.account_name(str(admin.database), 'reader')}'@'%'")
 

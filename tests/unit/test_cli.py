@@ -20,9 +20,10 @@ from typer.testing import CliRunner
 
 from semdb.cli import main as cli
 from semdb.cli.options import Overrides, load_settings, settings_options
-from semdb.cli.output import cell_text, print_rows, to_jsonable
+from semdb.cli.output import cell_text, print_rows
 from semdb.cli.progress import Progress, format_duration
 from semdb.errors import RecordingError, UsageError
+from semdb.jsonable import to_jsonable
 
 HEAVY = {"numba", "cv2", "scipy", "onnxruntime", "sqlalchemy", "matplotlib", "alembic", "pydantic", "numpy", "celery"}
 

@@ -18,9 +18,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from semdb.cli.output import distinct, print_csv, print_json, print_rows, print_table, to_jsonable
+from semdb.cli.output import distinct, print_csv, print_json, print_rows, print_table
 from semdb.cli.progress import Progress, StagedProgress, say
 from semdb.events import JsonFormatter, PlainFormatter, event
+from semdb.jsonable import to_jsonable
 from semdb.shown import (
     for_html,
     for_json,

@@ -22,8 +22,11 @@ from semdb.cli.sql_text import statements
 from semdb.database import codecs
 from semdb.database.blob_text import describe_blob, size_text
 from semdb.database.catalogue import tables_and_columns
+from semdb.database.readonly import run_readonly
+from semdb.database.statement import HIDDEN
 from semdb.database.store import open_store
 from semdb.database.tables import metadata
+from semdb.errors import DatabaseError
 from semdb.settings import Settings
 from semdb.types import Features, Keypoints
 from tests.database_samples import fill
@@ -201,10 +204,16 @@ def test_completion_knows_tables_and_columns(line: str, expected: list[str]) -> 
 
 def test_the_catalogue_has_every_table_and_view() -> None:
     known = tables_and_columns(Settings(database_url="sqlite:///semdb.sqlite3"))
-    for table in metadata.tables.values():
+    shown = [table for table in metadata.tables.values() if table.name not in HIDDEN]
+    assert "access_tokens" not in known
+    for table in shown:
         assert known[table.name] == tuple(column.name for column in table.columns)
     assert "category" in known["keyframe_objects"]
     assert "alembic_version" not in known
+    for name in ("access_tokens", "Access_Tokens", '"access_tokens"', "[access_tokens]", "main.access_tokens"):
+        for what in ("*", "COUNT(*)", "1", "hash"):
+            with pytest.raises(DatabaseError, match=r"prohibited|not authorized"):
+                run_readonly(Settings(), f"SELECT {what} FROM {name}")
     assert not [name for name in known if name.startswith("sqlite")]
 
 

@@ -13,6 +13,7 @@ import pytest
 import typer
 
 from semdb.cli.main import COMMANDS, load_command
+from semdb.service.settings import ServeSettings
 from semdb.settings import Settings
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -120,6 +121,14 @@ def test_every_setting_is_documented_with_its_default() -> None:
         (row,) = re.findall(rf"^\| `SEMDB_{name.upper()}` .*$", text, flags=re.M)
         default = "none" if field.default is None else f"`{field.default}`"
         assert default in row, f"docs/settings.md: SEMDB_{name.upper()} has the default {default}"
+
+
+def test_every_setting_of_the_service_is_documented_with_its_default() -> None:
+    text = (REPOSITORY / "docs" / "settings.md").read_text()
+    for name, field in ServeSettings.model_fields.items():
+        (row,) = re.findall(rf"^\| `SEMDB_SERVE_{name.upper()}` .*$", text, flags=re.M)
+        default = "none" if field.default is None else f"`{field.default}`"
+        assert default in row, f"docs/settings.md: SEMDB_SERVE_{name.upper()} has the default {default}"
 
 
 # Where text goes to a terminal or into a page as it is; everything else goes through what escapes names (semdb.shown).

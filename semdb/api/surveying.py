@@ -1,0 +1,79 @@
+"""What pages and services show of a map beside its rows: files as recorded, relations, coverage, the log of queries."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from semdb.api.base import Base
+from semdb.database.records import StoredImage
+from semdb.errors import UsageError
+
+if TYPE_CHECKING:
+    from semdb.database.landmark_reading import StoredRelation
+    from semdb.database.query_log import LoggedQuery
+    from semdb.localization.coverage import Coverage
+
+
+class Surveying(Base):
+    """Looks at what a map covers and was asked."""
+
+    def keyframe_files(self, keyframe_id: int) -> StoredImage:
+        """The colour and depth files of a keyframe, bytes as recorded. Raises NotFoundError, CodecError."""
+        return self._store().load_image(keyframe_id)
+
+    def relations(self, map: str) -> list[StoredRelation]:
+        """How the landmarks of a map stand to each other, by ids. Raises NotFoundError, CodecError."""
+        from semdb.database.landmark_reading import load_landmarks
+
+        store = self._store()
+        return load_landmarks(store.engine, self._head(map).id)[1]
+
+    def up(self, map: str) -> tuple[float, float, float] | None:
+        """Which way is up in a map, a unit vector; None where nobody found out. Raises NotFoundError, CodecError."""
+        from semdb.database.landmark_rows import load_gravity
+
+        found = load_gravity(self._store().engine, self._head(map).id)
+        return None if found is None else found.up
+
+    def coverage(self, map: str, position: Sequence[float] | None = None, *, radius_m: float = 2.0) -> Coverage:
+        """How many keyframes are within `radius_m` of a place (X, Y, Z in metres), or at all, and where they look.
+
+        Raises NotFoundError, UsageError for a place or radius that is none.
+        """
+        import math
+
+        import numpy as np
+
+        from semdb.localization.coverage import coverage_of
+
+        if position is not None and (len(position) != 3 or not all(is_coordinate(value) for value in position)):
+            raise UsageError(f"a place is three numbers in metres, x, y, z, not {tuple(position)}")
+        if not (math.isfinite(radius_m) and 0 < radius_m <= 1e4):
+            raise UsageError(f"a radius is a number of metres between 0 and 10000, not {radius_m}")
+        store, head = self._store(), self._head(map)
+        ids, poses = store.poses(head.id, bad=store.left_out)
+        place = None if position is None else (float(position[0]), float(position[1]), float(position[2]))
+        return coverage_of(head.name, np.array(ids, np.int64), poses, place, float(radius_m))
+
+    def queries(self, map: str, *, before: int | None = None, limit: int = 100) -> list[LoggedQuery]:
+        """What was localized in a map, the newest first; `before` the id of the last one that is known already.
+
+        Raises NotFoundError, UsageError for a limit that is none, CodecError for a damaged row.
+        """
+        from semdb.database.query_log import list_queries
+
+        if not 1 <= limit <= 10_000:
+            raise UsageError(f"limit is between 1 and 10000, not {limit}")
+        return list_queries(self._store().engine, self._head(map).id, before=before, limit=limit)
+
+    def forget_queries(self, older_than_s: int) -> int:
+        """Deletes what was logged more than so many seconds ago, in all maps. Returns how many."""
+        from semdb.database.query_log import forget_queries
+
+        return forget_queries(self._store().engine, older_than_s)
+
+
+def is_coordinate(value: float) -> bool:
+    """Whether a coordinate can be one of a map."""
+    return -1e7 < value < 1e7

@@ -1,0 +1,235 @@
+"""Maps, recordings, and what is known of a map."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import Query, Request
+from starlette.responses import Response
+
+from semdb.api import Database
+from semdb.service import schemas, values
+from semdb.service.answers import as_json, page_of
+from semdb.service.problems import Problem, not_found
+from semdb.service.roles import ADMIN, READ
+from semdb.service.routing import AfterId, KeyframeId, Limit, MapName, Table
+from semdb.service.state import access_of, read, service_of
+
+table = Table("maps")
+Coordinate = Annotated[float | None, Query(ge=-1e7, le=1e7, allow_inf_nan=False, description="metres")]
+
+
+@table.route("GET", "/v1/maps", READ, schemas.Page[schemas.Map])
+async def list_maps(request: Request, after: AfterId = 0, limit: Limit = None) -> Response:
+    """The maps that the token may see, by id."""
+    most, access = limit or service_of(request).settings.page, access_of(request)
+    found = await read(request, lambda db: db.maps())
+    seen = [info for info in found if access.sees(info.name) and info.id > after]
+    return page_of(request, seen[: most + 1], most, lambda info: info.id, values.map_dict)
+
+
+@table.route("GET", "/v1/maps/{map}", READ, schemas.MapDetail)
+async def get_map(request: Request, map: MapName) -> Response:
+    """A map: how it is described, what was refined, which way is up."""
+
+    def look(db: Database) -> dict[str, Any]:
+        info = db.map(map)
+        steps = [step for step in db.status(map).refinements if step.map_id == info.id]
+        up = db.up(map)
+        return values.map_dict(info) | {
+            "models": [values.model_dict(model) for model in db.models(map)],
+            "refinements": [
+                {"kind": s.kind, "current": s.current, "computed_at": f"{s.computed_at.isoformat()}Z", "rows": s.rows}
+                for s in steps
+            ],
+            "up": None if up is None else list(up),
+        }
+
+    return as_json(await read(request, look))
+
+
+@table.route("GET", "/v1/recordings", READ, schemas.Page[schemas.Recording])
+async def list_recordings(
+    request: Request,
+    map: Annotated[str | None, Query(max_length=255, description="only of this map")] = None,
+    after: AfterId = 0,
+    limit: Limit = None,
+) -> Response:
+    """The recordings of a map, or of all that the token may see, with what is planned and stored, by id."""
+    most, access = limit or service_of(request).settings.page, access_of(request)
+    if map is not None and not access.sees(map):
+        raise Problem(403, f"this token is not for the map {map!r}")
+    wanted = map if map is not None else access.map
+    found = await read(request, lambda db: db.recordings(wanted))
+    later = sorted((one for one in found if one.recording_id > after), key=lambda one: one.recording_id)
+    with_source = access.has(ADMIN)
+    return page_of(
+        *(request, later[: most + 1], most),
+        lambda one: one.recording_id,
+        lambda one: values.recording_dict(one, with_source=with_source),
+    )
+
+
+@table.route("GET", "/v1/maps/{map}/recordings/{recording}", READ, schemas.Recording)
+async def get_recording(request: Request, map: MapName, recording: str) -> Response:
+    """A recording of a map."""
+    found = await read(request, lambda db: db.recording(recording, map))
+    return as_json(values.recording_dict(found, with_source=access_of(request).has(ADMIN)))
+
+
+@table.route("GET", "/v1/maps/{map}/keyframes", READ, schemas.Page[schemas.Keyframe])
+async def list_keyframes(
+    request: Request,
+    map: MapName,
+    recording: Annotated[str | None, Query(max_length=255, description="only of this recording")] = None,
+    after: AfterId = 0,
+    limit: Limit = None,
+) -> Response:
+    """The keyframes of a map, or of a recording of it, by id."""
+    most = limit or service_of(request).settings.page
+    found = await read(request, lambda db: db.keyframes(map, recording, after=after, limit=most + 1))
+    return page_of(request, found, most, lambda one: one.id, values.keyframe_dict)
+
+
+@table.route("GET", "/v1/maps/{map}/landmarks", READ, schemas.Page[schemas.Landmark])
+async def list_landmarks(
+    request: Request,
+    map: MapName,
+    category: Annotated[str | None, Query(max_length=255, description="only of this class")] = None,
+    state: Annotated[str | None, Query(max_length=16, description="tentative, confirmed or gone")] = None,
+    after: AfterId = 0,
+    limit: Limit = None,
+) -> Response:
+    """The landmarks of a map by id: things that several keyframes see. `semdb refine` computes them."""
+    most = limit or service_of(request).settings.page
+    found = [
+        one
+        for one in await read(request, lambda db: db.landmarks(map))
+        if one.id > after and category in (None, one.category) and state in (None, one.state)
+    ]
+    return page_of(request, found[: most + 1], most, lambda one: one.id, lambda one: values.landmark_dict(one, map))
+
+
+@table.route("GET", "/v1/maps/{map}/landmarks/{landmark}", READ, schemas.Landmark)
+async def get_landmark(request: Request, map: MapName, landmark: KeyframeId) -> Response:
+    """A landmark, and how it stands to others."""
+
+    def look(db: Database) -> dict[str, Any]:
+        found = [one for one in db.landmarks(map) if one.id == landmark]
+        if not found:
+            raise not_found(f"landmark {landmark} in the map {map!r}")
+        related = [one for one in db.relations(map) if landmark in (one.landmark_id, one.other_landmark_id)]
+        shown = [values.relation_dict(one) for one in related]
+        return values.landmark_dict(found[0], map) | {"relations": shown}
+
+    return as_json(await read(request, look))
+
+
+@table.route("GET", "/v1/maps/{map}/relations", READ, schemas.Page[schemas.Relation])
+async def list_relations(
+    request: Request,
+    map: MapName,
+    kind: Annotated[str | None, Query(max_length=32, description="only of this kind: on, near, ...")] = None,
+    after: Annotated[str | None, Query(max_length=100, description="key of an earlier page")] = None,
+    limit: Limit = None,
+) -> Response:
+    """How the landmarks of a map stand to each other, by ids."""
+    most = limit or service_of(request).settings.page
+
+    def key(one: Any) -> tuple[int, int, str]:
+        return (one.landmark_id, one.other_landmark_id, one.kind)
+
+    found = [one for one in await read(request, lambda db: db.relations(map)) if kind in (None, one.kind)]
+    later = [one for one in sorted(found, key=key) if after is None or key(one) > _relation_key(after)]
+    return page_of(
+        *(request, later[: most + 1], most),
+        lambda one: "-".join(str(part) for part in key(one)),
+        values.relation_dict,
+    )
+
+
+def _relation_key(after: str) -> tuple[int, int, str]:
+    first, _, rest = after.partition("-")
+    second, _, kind = rest.partition("-")
+    if not (first.isdecimal() and second.isdecimal()):
+        raise Problem(422, "after is no key of an earlier page")
+    return int(first), int(second), kind
+
+
+@table.route("GET", "/v1/find", READ, schemas.Found)
+async def find(
+    request: Request,
+    what: Annotated[str, Query(min_length=1, max_length=255, description="a class, or a word for one")],
+    near: Annotated[str | None, Query(min_length=1, max_length=255)] = None,
+    on: Annotated[str | None, Query(min_length=1, max_length=255)] = None,
+    not_near: Annotated[str | None, Query(min_length=1, max_length=255)] = None,
+    map: Annotated[str | None, Query(max_length=255, description="only in this map")] = None,
+    seen_after: Annotated[str | None, Query(max_length=255, description="a time, or a recording")] = None,
+    x: Coordinate = None,
+    y: Coordinate = None,
+    z: Coordinate = None,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 10,
+) -> Response:
+    """Where things are: landmarks of a class or word, the best first; `x`, `y`, `z`: the nearer to there the better."""
+    access = access_of(request)
+    if map is not None and not access.sees(map):
+        raise Problem(403, f"this token is not for the map {map!r}")
+    where, origin = map if map is not None else access.map, place(x, y, z)
+    found = await read(
+        request,
+        lambda db: db.find(
+            what, near=near, on=on, not_near=not_near, map=where, seen_after=seen_after, origin=origin, limit=limit
+        ).as_dict(),
+    )
+    return as_json(found)
+
+
+def place(x: float | None, y: float | None, z: float | None) -> tuple[float, float, float] | None:
+    """A place, or none. Raises Problem 422 for a part of one."""
+    if x is None and y is None and z is None:
+        return None
+    if x is None or y is None or z is None:
+        raise Problem(422, "a place is x, y and z: give all of them, or none")
+    return x, y, z
+
+
+@table.route("GET", "/v1/maps/{map}/loops", READ, schemas.Page[schemas.Link])
+async def list_loops(
+    request: Request,
+    map: MapName,
+    odometry: Annotated[bool, Query(description="also what follows each other")] = False,
+    after: Annotated[int, Query(ge=0, le=2**53, description="key of an earlier page")] = 0,
+    limit: Limit = None,
+) -> Response:
+    """What ties keyframes of a map together, by ids."""
+    most = limit or service_of(request).settings.page
+    found = list(enumerate(await read(request, lambda db: db.loops(map, odometry=odometry)), 1))
+    later = found[after : after + most + 1]
+    return page_of(request, later, most, lambda one: one[0], lambda one: values.link_dict(one[1]))
+
+
+@table.route("GET", "/v1/maps/{map}/queries", READ, schemas.Page[schemas.Query])
+async def list_queries(
+    request: Request,
+    map: MapName,
+    before: Annotated[int | None, Query(ge=1, le=2**63 - 1, description="key of an earlier page")] = None,
+    limit: Limit = None,
+) -> Response:
+    """What was localized in a map, the newest first."""
+    most = limit or service_of(request).settings.page
+    found = await read(request, lambda db: db.queries(map, before=before, limit=most + 1))
+    return page_of(request, found, most, lambda one: one.id, values.query_dict, by="before")
+
+
+@table.route("GET", "/v1/maps/{map}/coverage", READ, schemas.CoverageModel)
+async def get_coverage(
+    request: Request,
+    map: MapName,
+    x: Coordinate = None,
+    y: Coordinate = None,
+    z: Coordinate = None,
+    radius: Annotated[float, Query(gt=0, le=1e4, description="metres")] = 2.0,
+) -> Response:
+    """How many keyframes are near a place, or at all, and where they look: whether localizing there can be expected."""
+    where = place(x, y, z)
+    return as_json((await read(request, lambda db: db.coverage(map, where, radius_m=radius))).as_dict())

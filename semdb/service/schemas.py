@@ -1,0 +1,340 @@
+"""What answers look like, for the OpenAPI document. Answers themselves are made by `values` and not checked again."""
+
+from __future__ import annotations
+
+from typing import Any, Generic, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Vector3 = list[float]
+Matrix = list[list[float]]
+ItemT = TypeVar("ItemT")
+
+
+class Model(BaseModel):
+    """An object whose members may become more."""
+
+    model_config = ConfigDict(extra="allow")
+
+
+class Problem(Model):
+    """An error (RFC 9457)."""
+
+    type: str = Field(examples=["urn:semdb:problem:not-found"])
+    title: str = Field(examples=["Not found"])
+    status: int = Field(examples=[404])
+    detail: str = Field(examples=["there is no map 'attic'"])
+    request_id: str = Field(examples=["6f1c2a0b9d3e4f58"])
+
+
+class Page(Model, Generic[ItemT]):
+    """Part of a list. `next` is the address of what follows, `after` (or `before`) its key; null at the end."""
+
+    items: list[ItemT]
+    next: str | None = Field(examples=["/v1/maps/office/keyframes?after=100"])
+    key: str | None = Field(examples=["100"])
+
+
+class Map(Model):
+    """A world frame."""
+
+    name: str = Field(examples=["office"])
+    id: int
+    keyframes: int = Field(examples=[40])
+    recordings: int = Field(examples=[1])
+
+
+class ModelOf(Model):
+    """A network or feature that made rows."""
+
+    role: str = Field(examples=["features"])
+    name: str = Field(examples=["surf"])
+    sha256: str
+    config: str
+
+
+class Step(Model):
+    """A step of `semdb refine` that was run."""
+
+    kind: str = Field(examples=["landmarks"])
+    current: bool
+    computed_at: str
+    rows: int
+
+
+class MapDetail(Map):
+    """A world frame, how it is described, and which way is up."""
+
+    models: list[ModelOf]
+    refinements: list[Step]
+    up: Vector3 | None = Field(examples=[[0.0, 0.0, 1.0]])
+
+
+class Recording(Model):
+    """A recording of a map, what is planned and stored of it. `source` only for role admin."""
+
+    id: int
+    map: str
+    name: str
+    format: str
+    source: str | None
+    state: str = Field(examples=["complete"])
+    frame_count: int
+    items: dict[str, int]
+    keyframes: int
+    objects: int
+    keypoints: int
+
+
+class CameraModel(Model):
+    """Intrinsics in pixels, OpenCV's distortion k1, k2, p1, p2[, k3]."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: list[float]
+
+
+class Pose(Model):
+    """Of the camera in the map: metres, camera axes x right, y down, z forward."""
+
+    position: Vector3
+    quat_wxyz: list[float]
+
+
+class Keyframe(Model):
+    """A keyframe without what is large."""
+
+    id: int
+    map: str
+    recording: str
+    frame_index: int
+    timestamp_ns: int | None
+    camera: CameraModel
+    pose: Pose
+    world_from_camera: Matrix
+
+
+class Mask(Model):
+    """Pixels of an object, COCO's uncompressed RLE: `size` is height and width, `counts` go down the columns."""
+
+    size: list[int]
+    counts: list[int]
+
+
+class SeenObject(Model):
+    """An object of an image: box x1, y1, x2, y2 in pixels, place and size in metres where there is depth."""
+
+    id: int | None
+    category: str = Field(examples=["chair"])
+    score: float
+    box: list[float]
+    position: Vector3 | None
+    extent: Vector3 | None
+    mask: Mask | None = None
+
+
+class Objects(Model):
+    """The objects of a keyframe, by ordinal."""
+
+    keyframe: int
+    objects: list[SeenObject]
+
+
+class KeypointColumns(Model):
+    """Keypoints column by column, by object; points in metres in the camera's frame."""
+
+    categories: list[str]
+    x: list[float]
+    y: list[float]
+    size: list[float]
+    angle: list[float]
+    response: list[float]
+    laplacian: list[int]
+    object_index: list[int]
+    points: list[list[float | None]]
+
+
+class CandidateModel(Model):
+    """A keyframe that was looked at."""
+
+    keyframe: int
+    recording: str
+    frame_index: int
+    class_score: float | None
+    cosine: float | None
+    inliers: int
+
+
+class Answer(Model):
+    """Where an image was taken. A pose only for `localized` and `ambiguous`; `failed` is an answer, too."""
+
+    image: str
+    verdict: Literal["localized", "ambiguous", "coarse", "failed"]
+    map: str
+    pose: Pose | None
+    world_from_camera: Matrix | None
+    covariance: Matrix | None = Field(description="6x6: translation (m), then rotation (rad)")
+    confidence: float | None
+    inliers: int
+    stage: str
+    reason: str
+    candidates: list[CandidateModel]
+    objects: list[SeenObject]
+    notes: list[str] = Field(description="what was assumed")
+    timing_ms: dict[str, float | None]
+
+
+class BatchItem(Model):
+    """The answer for one image, or why it could not be read."""
+
+    answer: Answer | None
+    problem: Problem | None
+
+
+class Batch(Model):
+    """Answers in the order of the images."""
+
+    items: list[BatchItem]
+
+
+class Session(Model):
+    """A session: where its frames go. `tracking`: whether an answer knows the one before."""
+
+    session: str
+    map: str
+    seconds: int = Field(description="how long it is valid")
+    frames: str = Field(examples=["/v1/sessions/SESSION/frames"])
+    stream: str = Field(examples=["/v1/sessions/SESSION/stream"])
+    tracking: bool
+
+
+class DeletedModel(Model):
+    """What was deleted."""
+
+    recordings: int
+    keyframes: int
+
+
+class JobModel(Model):
+    """A job: `waiting`, `running`, `working` (workers have it), `done` or `failed`."""
+
+    job: int
+    address: str = Field(examples=["/v1/jobs/1"])
+    map: str
+    state: str = Field(examples=["running"])
+    recordings: list[dict[str, Any]]
+    items: dict[str, int] | None = Field(description="keyframes by their state", examples=[{"done": 4, "pending": 2}])
+    progress: dict[str, Any] | None = Field(examples=[{"what": "ingesting room", "done": 4, "total": 6}])
+    error: str | None
+
+
+class UploadModel(Model):
+    """Files that came: `upload` is what `ingest` takes."""
+
+    upload: str
+    name: str
+    bytes: int
+
+
+class Landmark(Model):
+    """A thing that several keyframes see."""
+
+    id: int
+    map: str
+    category: str
+    probability: float
+    position: Vector3
+    covariance: Matrix
+    box: dict[str, Any]
+    state: str = Field(examples=["confirmed"])
+    sightings: int
+    keyframes: int
+
+
+class Relation(Model):
+    """How a landmark stands to another one."""
+
+    landmark: int
+    kind: str = Field(examples=["on"])
+    other_landmark: int
+    score: float
+
+
+class Found(Model):
+    """Landmarks that were asked for, the best first; where there is none, `missing` says why."""
+
+    understood: dict[str, dict[str, Any]]
+    hits: list[dict[str, Any]]
+    missing: dict[str, Any] | None
+
+
+class Link(Model):
+    """What ties two keyframes together."""
+
+    map: str
+    keyframe: int
+    other_keyframe: int
+    kind: str
+    state: str
+    inliers: int
+    off_m: float | None
+    off_deg: float | None
+
+
+class Query(Model):
+    """A localization that was logged."""
+
+    id: int
+    created_at: str
+    image: str
+    verdict: str
+    pose: Pose | None
+    confidence: float
+
+
+class CoverageModel(Model):
+    """What a map's keyframes cover, or are near a place."""
+
+    available: bool
+    map: str
+    keyframes: int
+    position: Vector3 | None
+    radius_m: float
+    near: int
+    nearest_m: float | None
+    nearest_keyframe: int | None
+    low: Vector3 | None
+    high: Vector3 | None
+    directions: list[int]
+
+
+class Rows(Model):
+    """Rows of a statement. `truncated`: there were more."""
+
+    columns: list[str]
+    rows: list[list[Any]]
+    truncated: bool
+
+
+class Tables(Model):
+    """Columns by table or view."""
+
+    tables: dict[str, list[str]]
+
+
+class Health(Model):
+    """The process answers."""
+
+    status: Literal["ok"]
+    version: str
+
+
+class Ready(Model):
+    """Whether localizations can be answered, and what is in the way where not."""
+
+    ready: bool
+    checks: dict[str, str]

@@ -1,0 +1,250 @@
+"""The service over HTTP: what it answers is what the library answers, bit for bit."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from semdb.api import Answer
+from semdb.jsonable import to_jsonable
+from semdb.service import values
+from semdb.service.settings import ServeSettings
+from semdb.types import Frame
+from tests.integration.conftest import constant_networks
+from tests.integration.opened import STRIDE, opener
+from tests.serving import Served, form_of, png, running
+
+
+@pytest.fixture(scope="module")
+def served(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """A service of this process on a map of six keyframes, with landmarks."""
+    folder = tmp_path_factory.mktemp("served")
+    with opener(f"sqlite:///{folder / 'a.sqlite3'}", folder / "cache") as opening:
+        database = opening()
+        database.ingest(room, map="office", stride=STRIDE)
+        models = folder / "cache" / "models"
+        models.mkdir(parents=True)
+        opening(**constant_networks(models)).ingest(room, map="a/b", name="stairs", stride=12)
+        auto = dict.fromkeys(("detector", "encoder", "features"), "auto")  # each map's own
+        with running(opening(sql_time_limit_s=2.0, **auto), ServeSettings()) as found:
+            yield found
+
+
+@pytest.fixture
+def get(served: Served) -> Any:
+    def get(path: str, **parameters: Any) -> Any:
+        answer = served.client.get(path, params=parameters or None)
+        assert answer.status_code == 200, answer.text
+        return answer.json()
+
+    return get
+
+
+def untimed(answer: dict[str, Any]) -> str:
+    return json.dumps({name: value for name, value in answer.items() if name not in ("timing_ms", "notes")})
+
+
+def as_sent(answer: Answer, **more: Any) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(json.dumps(to_jsonable(values.answer_dict(answer, **more))))
+    return found
+
+
+def test_an_image_is_localized_as_by_the_library(served: Served, frames: list[Frame]) -> None:
+    frame = frames[6]
+    form, files = form_of(frame)
+    asked = served.client.post("/v1/maps/office/localize", data={**form, "masks": "true"}, files=files)
+    assert asked.status_code == 200, asked.text
+    found = asked.json()
+    wanted = served.database.localize(replace(frame, depth=None), map="office", name="frame")
+    assert untimed(found) == untimed(as_sent(wanted, masks=True))
+    assert found["verdict"] == "localized"
+    assert np.array_equal(found["world_from_camera"], wanted.world_from_camera)
+    assert np.array_equal(found["covariance"], wanted.covariance)
+    for thing, own in zip(found["objects"], wanted.objects, strict=True):
+        assert np.array_equal(values.mask_of(thing["mask"]), own.mask)
+    anywhere = served.client.post("/v1/localize", data=form, files=files).json()
+    assert (anywhere["map"], anywhere["pose"]) == ("office", found["pose"])
+
+
+def test_depth_and_several_images(served: Served, frames: list[Frame]) -> None:
+    form, files = form_of(frames[7], depth=True)
+    found = served.client.post("/v1/maps/office/localize", data=form, files=files).json()
+    wanted = served.database.localize(frames[7], map="office", name="frame")
+    assert untimed(found) == untimed(as_sent(wanted))
+    answer = served.client.post("/v1/maps/office/localize", files={"image": files["image"]})
+    assert "brings no masks" in answer.json()["detail"]  # a map of masks that images do not bring
+
+
+def test_several_images(served: Served, frames: list[Frame]) -> None:
+    pictures = [png(frames[number].image[..., ::-1]) for number in (0, 13)]
+    sent = [("image", ("a.png", data)) for data in (pictures[0], b"no picture", pictures[1])]
+    answer = served.client.post("/v1/maps/a%2Fb/localize/batch", files=sent)
+    assert answer.status_code == 200, answer.text
+    first, none, second = answer.json()["items"]
+    wanted = served.database.localize(pictures, map="a/b", name=["image 0", "image 2"])
+    for item, own in zip((first, second), wanted, strict=True):
+        assert untimed(item["answer"]) == untimed(as_sent(own))
+        assert "that of the map's keyframes" in item["answer"]["notes"][0]
+    assert none["answer"] is None
+    assert "is not an image" in none["problem"]["detail"]
+
+
+def test_maps_recordings_and_keyframes_page_by_page(served: Served, get: Any) -> None:
+    assert [item["name"] for item in get("/v1/maps")["items"]] == ["office", "a/b"]
+    first = get("/v1/maps", limit=1)
+    assert (first["key"], first["next"]) == ("1", "/v1/maps?limit=1&after=1")
+    assert get(first["next"])["items"][0]["name"] == "a/b"
+    about = get("/v1/maps/office")
+    assert [model["name"] for model in about["models"]] == ["recorded", "gist", "surf"]
+    assert get("/v1/maps/a%2Fb")["name"] == "a/b"
+    assert [item["name"] for item in get("/v1/recordings")["items"]] == ["room", "stairs"]
+    assert get("/v1/recordings", map="a/b")["items"][0]["source"].endswith("room")  # loopback is admin
+    assert get("/v1/maps/a%2Fb/recordings/stairs")["keyframes"] == 2
+    seen, address = [], "/v1/maps/office/keyframes?limit=4"
+    while address:
+        page = get(address)
+        seen += page["items"]
+        address = page["next"]
+    own = served.database.keyframes("office")
+    assert [item["id"] for item in seen] == [keyframe.id for keyframe in own]
+    assert all(np.array_equal(a["world_from_camera"], b.world_from_camera) for a, b in zip(seen, own, strict=True))
+
+
+def test_what_a_keyframe_holds(served: Served, frames: list[Frame]) -> None:
+    keyframe = served.database.keyframes("office")[2]
+    address = f"/v1/keyframes/{keyframe.id}"
+    image = served.client.get(f"{address}/image")
+    stored = served.database.keyframe_files(keyframe.id)
+    assert image.content == stored.rgb
+    assert image.headers["content-type"] == "image/png"
+    assert "immutable" in image.headers["cache-control"]
+    again = served.client.get(f"{address}/image", headers={"If-None-Match": image.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+    depth = served.client.get(f"{address}/depth")
+    assert (depth.content, float(depth.headers["semdb-depth-scale"])) == (stored.depth, stored.depth_scale)
+    metres = np.load(io.BytesIO(served.client.get(f"{address}/depth", params={"metres": True}).content))
+    np.testing.assert_array_equal(metres, keyframe.depth)
+    things = served.client.get(f"{address}/objects", params={"masks": True}).json()["objects"]
+    assert [thing["category"] for thing in things] == [thing.category for thing in keyframe.objects]
+    assert all(np.array_equal(values.mask_of(a["mask"]), b.mask) for a, b in zip(things, keyframe.objects, strict=True))
+    labels = cv2.imdecode(np.frombuffer(served.client.get(f"{address}/mask").content, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert set(np.unique(labels)) == set(range(len(keyframe.objects) + 1))
+    points = served.client.get(f"{address}/keypoints").json()
+    assert np.array_equal(np.array(points["x"], np.float32), keyframe.keypoints.features.xy[:, 0])
+    assert np.array_equal(
+        np.array(points["points"], float).astype(np.float32), keyframe.keypoints.points, equal_nan=True
+    )
+    assert served.client.get(f"{address}/picture").content.startswith(b"\x89PNG")
+
+
+def test_what_is_known_of_a_map(served: Served, get: Any) -> None:
+    place = served.database.keyframes("office")[0].position
+    near = get("/v1/maps/office/coverage", **dict(zip("xyz", map(float, place), strict=True)), radius=0.1)
+    assert (near["available"], near["nearest_m"]) == (True, 0.0)
+    far = get("/v1/maps/office/coverage", x=900, y=0, z=0)
+    assert (far["available"], far["near"], far["keyframes"]) == (False, 0, 6)
+    assert get("/v1/find", what="chair", map="office")["missing"]["reason"] == "never_seen"
+    for name in ("landmarks", "relations", "loops"):
+        assert get(f"/v1/maps/office/{name}") == {"items": [], "next": None, "key": None}
+    logged = get("/v1/maps/office/queries", limit=1)
+    assert logged["items"][0]["verdict"] == "localized"
+    assert get(logged["next"])["items"][0]["id"] < logged["items"][0]["id"]
+
+
+def test_rows_by_statements(served: Served, get: Any) -> None:
+    statement = "SELECT recording, frame_index FROM keyframe_objects ORDER BY 2, 1 LIMIT 2"
+    found = get("/v1/sql", sql=statement)
+    assert (found["columns"], len(found["rows"]), found["truncated"]) == (["recording", "frame_index"], 2, False)
+    text = served.client.get("/v1/sql", params={"sql": statement}, headers={"Accept": "text/csv"}).text
+    assert text.splitlines()[0] == "recording,frame_index"
+    many = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n WHERE i < 5000) SELECT i FROM n"
+    answer = served.client.get("/v1/sql", params={"sql": many})
+    assert (len(answer.json()["rows"]), answer.headers["semdb-truncated"]) == (1000, "true")
+    slow = served.client.get(
+        "/v1/sql", params={"sql": many.replace("5000", "500000000").replace("i FROM", "MAX(i) FROM")}
+    )
+    assert (slow.status_code, "took longer than" in slow.json()["detail"]) == (422, True)
+    assert "keyframe_objects" in get("/v1/tables")["tables"]
+
+
+def test_the_service_says_how_it_is(served: Served, get: Any) -> None:
+    assert get("/health")["status"] == "ok"
+    assert get("/ready") == {"ready": True, "checks": {"database": "ok", "maps": "2 of 2 can be asked"}}
+    text = served.client.get("/metrics").text
+    assert 'semdb_requests_total{method="GET",route="/health",status="200"}' in text
+    assert 'semdb_localizations_total{verdict="localized"}' in text
+
+
+def test_every_error_is_a_problem(served: Served) -> None:
+    for method, path, status in (
+        ("GET", "/v1/maps/attic", 404),
+        ("GET", "/v1/nothing", 404),
+        ("GET", "/v1/keyframes/99999", 404),
+        ("GET", "/v1/keyframes/x", 422),
+        ("DELETE", "/health", 405),
+        ("GET", "/v1/maps?limit=0", 422),
+        ("GET", "/v1/find", 422),
+        ("POST", "/v1/maps/office/localize", 422),
+    ):
+        answer = served.client.request(method, path)
+        assert (answer.status_code, answer.headers["content-type"]) == (status, "application/problem+json"), path
+        told = answer.json()
+        assert told["status"] == status
+        assert told["request_id"] == answer.headers["x-request-id"]
+        assert str(served.folder) not in answer.text
+        assert "sqlite" not in answer.text
+
+
+def test_the_document_names_every_route(served: Served, get: Any) -> None:
+    document = get("/v1/openapi.json")
+    assert document["openapi"].startswith("3.1")
+    for path, item in document["paths"].items():
+        for method, operation in item.items():
+            assert operation["x-role"], (method, path)
+            assert operation["summary"]
+            assert operation["responses"]["429"]["content"]["application/problem+json"], (method, path)
+    assert {"/v1/maps/{map}/localize", "/v1/sql", "/v1/keyframes/{keyframe}/mask"} <= set(document["paths"])
+
+
+def test_a_session_by_http_and_over_a_connection(served: Served, frames: list[Frame]) -> None:
+    form, files = form_of(frames[6])
+    common = {"camera": form["camera"], "categories": json.loads(form["categories"]), "log": False}
+    opened = served.client.post("/v1/maps/office/sessions", json=common)
+    assert (opened.status_code, opened.json()["tracking"]) == (201, False), opened.text
+    wanted = untimed(as_sent(served.database.localize(replace(frames[6], depth=None), map="office", name="frame")))
+    sent = {name: form[name] for name in ("name", "frame_index", "timestamp_ns")}
+    assert untimed(served.client.post(opened.json()["frames"], data=sent, files=files).json()) == wanted
+    address = f"ws{served.url.removeprefix('http')}{opened.json()['stream']}"
+    with connect(address) as socket:
+        for number in (1, 2):
+            said = {"parts": ["image", "instances"], "name": "frame", "frame_index": 6}
+            socket.send(json.dumps(said | {"timestamp_ns": frames[6].timestamp_ns}))
+            for part in said["parts"]:
+                socket.send(files[part][1])
+            answer = json.loads(socket.recv(timeout=60))
+            assert (answer.pop("sequence"), answer.pop("ms") > 0) == (number, True)
+            assert untimed(answer) == wanted
+        socket.send(b"no picture")
+        assert json.loads(socket.recv(timeout=60))["status"] == 422
+        socket.send(json.dumps({"parts": ["image", "image"]}))
+        with pytest.raises(ConnectionClosed) as closed:
+            socket.recv(timeout=60)
+        assert (closed.value.rcvd.code, "expected as JSON" in closed.value.rcvd.reason) == (1008, True)
+    for session in ("none", opened.json()["session"][:-4] + "AAAA"):
+        assert served.client.post(f"/v1/sessions/{session}/frames", files=files).status_code == 404
+        with pytest.raises(InvalidStatus):
+            connect(f"ws{served.url.removeprefix('http')}/v1/sessions/{session}/stream")
+    with pytest.raises(InvalidStatus):
+        connect(address, origin="https://evil.example")
+    assert served.client.post("/v1/maps/office/sessions", json={"depth": 1}).status_code == 422
+    assert served.client.post("/v1/maps/attic/sessions", json={}).status_code == 404
