@@ -1,4 +1,5 @@
 # make demo   install the base into .venv and run the demonstration (no setting, no model file needed)
+# make serve  serve the map of the demonstration at http://127.0.0.1:8765 (made first where it is not there)
 # make test   install everything, MySQL and MariaDB included, then lint, types and all tests
 # make test-long   as make test, for the tests that it leaves out: they take minutes each
 # make test-train   train a small detector on rendered rooms from random weights; 8 minutes on 2 cores
@@ -17,7 +18,7 @@ LOCK := requirements/constraints.txt
 # two processes: each starts servers of its own
 PYTEST_ARGS ?= --numprocesses 2
 
-.PHONY: help demo test test-long test-train unit lint services lock bench wheel clean
+.PHONY: help demo serve test test-long test-train unit lint services lock bench wheel clean
 
 help:
 	@sed -n 's/^# \(make \)/\1/p' Makefile
@@ -34,10 +35,21 @@ $(VENV)/.stamp-base: pyproject.toml $(LOCK) | $(BIN)/python
 $(VENV)/.stamp-dev: pyproject.toml $(LOCK) | $(BIN)/python
 	@echo "installing semdb with the torch (several GB), worker, serve and development extras into $(VENV)"
 	@$(PIP) install --constraint $(LOCK) --editable '.[torch,worker,serve,dev]'
-	@touch $(VENV)/.stamp-base $@
+	@touch $(VENV)/.stamp-base $(VENV)/.stamp-serve $@
 
 demo: $(VENV)/.stamp-base
 	@scripts/demo.sh $(BIN)/semdb
+
+$(VENV)/.stamp-serve: pyproject.toml $(LOCK) | $(BIN)/python
+	@echo "installing semdb and the serve extra into $(VENV)"
+	@$(PIP) install --constraint $(LOCK) --editable '.[serve]'
+	@touch $(VENV)/.stamp-base $@
+
+demo-output/semdb.sqlite3: | $(VENV)/.stamp-base
+	@scripts/demo.sh $(BIN)/semdb
+
+serve: $(VENV)/.stamp-serve | demo-output/semdb.sqlite3
+	@SEMDB_DATABASE_URL=sqlite:///demo-output/semdb.sqlite3 $(BIN)/semdb serve
 
 services:
 	@scripts/install-services.sh

@@ -174,17 +174,18 @@ class Reading(Base):
 
         return plot_found(self._store(), found, Path(folder))
 
-    def sql(self, statement: str) -> Rows:
+    def sql(self, statement: str, *, private: bool = False) -> Rows:
         """The rows of one read-only statement, fetched while they are iterated over.
 
         On a server it runs as the account of ``SEMDB_READER_URL``. Raises UsageError for what is no query,
         DatabaseError where the database refuses it or the time limit ``SEMDB_SQL_TIME_LIMIT_S`` is over, also while
-        rows are fetched.
+        rows are fetched. With `private` nothing is told of where files lie: such columns are null, and of a server
+        their tables are refused.
         """
         from semdb.database.catalogue import ask
 
         self._here.check_open()
-        return Rows(*ask(self.settings, statement))
+        return Rows(*ask(self.settings, statement, private=private))
 
     def tables(self) -> dict[str, tuple[str, ...]]:
         """The columns of each table and view that `sql` can ask. Raises what `sql` raises."""

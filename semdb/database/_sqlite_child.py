@@ -67,8 +67,7 @@ def _run(request: dict[str, Any]) -> None:
     connection.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
     connection.execute(f"PRAGMA hard_heap_limit = {request['memory'] // 2}")
     connection.execute("PRAGMA query_only = ON")
-    hidden = frozenset(request["hidden"])
-    connection.set_authorizer(lambda *asked: _authorize(hidden, *asked))
+    connection.set_authorizer(lambda *asked: _authorize(request["hidden"], request["private"], *asked))
     connection.set_progress_handler(lambda: int(time.monotonic() > deadline), 10_000)
     cursor = connection.execute(request["sql"])
     if cursor.description is None:
@@ -87,11 +86,17 @@ def _run(request: dict[str, Any]) -> None:
         _send(("rows", rows))
 
 
-def _authorize(hidden: frozenset[str], action: int, first: str | None, second: str | None, *_: str | None) -> int:
+def _authorize(
+    hidden: list[str], private: dict[str, str], action: int, first: str | None, second: str | None, *_: str | None
+) -> int:
     if action not in _ALLOWED_ACTIONS:
         return sqlite3.SQLITE_DENY
-    if action == sqlite3.SQLITE_READ and (first or "").lower() in hidden:
-        return sqlite3.SQLITE_DENY
+    if action == sqlite3.SQLITE_READ:
+        table, column = (first or "").lower(), (second or "").lower()
+        if table in hidden:
+            return sqlite3.SQLITE_DENY
+        if private.get(table) == column:
+            return sqlite3.SQLITE_IGNORE  # it is null
     if action == sqlite3.SQLITE_FUNCTION and (second or "").lower() in _DENIED_FUNCTIONS:
         return sqlite3.SQLITE_DENY
     return sqlite3.SQLITE_OK

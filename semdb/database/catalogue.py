@@ -36,10 +36,10 @@ def tables_and_columns(settings: Settings) -> dict[str, tuple[str, ...]]:
     return found
 
 
-def ask(settings: Settings, sql: str) -> tuple[tuple[str, ...], Generator[Row, None, None]]:
+def ask(settings: Settings, sql: str, *, private: bool = False) -> tuple[tuple[str, ...], Generator[Row, None, None]]:
     """As `run_readonly`, and an error of a table that is not there names those that are called alike."""
     try:
-        return run_readonly(settings, sql)
+        return run_readonly(settings, sql, private=private)
     except DatabaseError as error:
         missing = _NO_TABLE.search(str(error))
         if missing is None:

@@ -24,25 +24,31 @@ Row = tuple[Any, ...]
 _READ_GRACE_S = 10
 
 
-def run_readonly(settings: Settings, sql: str) -> tuple[tuple[str, ...], Generator[Row, None, None]]:
+def run_readonly(
+    settings: Settings, sql: str, *, private: bool = False
+) -> tuple[tuple[str, ...], Generator[Row, None, None]]:
     """The column names and the rows of one read-only statement; close the iterator to end it early.
 
+    With `private` nothing is told of where files lie: such columns are null, and of a server their tables are refused.
     Decimals of a server (its sums) come as int where they are whole, as float where one holds them, as on SQLite.
     Raises UsageError when it is no SELECT, locks what it reads, lifts its limits, or the account is not set,
     DatabaseError when the database refuses it, its account may do more than read, or the time limit of
     `sql_time_limit_s` is over (also while rows are fetched).
     """
     file, limit_s, too_slow = file_of(settings), settings.sql_time_limit_s, _too_slow(settings)
-    _check_statement(sql, server=file is None)
-    rows = _server(settings, sql) if file is None else readonly_sqlite.rows_of(file, sql, limit_s, too_slow)
+    _check_statement(sql, server=file is None, private=private)
+    if file is None:
+        rows = _server(settings, sql)
+    else:
+        rows = readonly_sqlite.rows_of(file, sql, limit_s, too_slow, private=private)
     columns = next(rows)  # connects and runs the statement
     return tuple(str(name) for name in columns), rows
 
 
-def _check_statement(sql: str, *, server: bool) -> None:
+def _check_statement(sql: str, *, server: bool, private: bool) -> None:
     check_reads(sql)
     if server:
-        check_hidden(sql)
+        check_hidden(sql, private=private)
         check_limits(sql)
 
 

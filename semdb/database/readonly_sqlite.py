@@ -24,7 +24,7 @@ from typing import Any
 
 from semdb.database import sqlite_file
 from semdb.database.sqlite_file import Opening
-from semdb.database.statement import HIDDEN
+from semdb.database.statement import HIDDEN, PRIVATE
 from semdb.errors import DatabaseError, SemdbError, UsageError
 
 Row = tuple[Any, ...]
@@ -37,7 +37,9 @@ _PROGRAM = Path(__file__).with_name("_sqlite_child.py")
 _LENGTH = struct.Struct("<I")
 
 
-def rows_of(path: Path, sql: str, limit_s: float, too_slow: str) -> Generator[Row, None, None]:
+def rows_of(
+    path: Path, sql: str, limit_s: float, too_slow: str, *, private: bool = False
+) -> Generator[Row, None, None]:
     """The names of the columns, then the rows; close it to end the statement early. `path` as `real_path` gives it.
 
     Raises UsageError for a statement without rows, DatabaseError when it is refused or over a limit (`too_slow`: what
@@ -51,6 +53,7 @@ def rows_of(path: Path, sql: str, limit_s: float, too_slow: str) -> Generator[Ro
             "uri": f"{path.absolute().as_uri()}?{query}",
             "sql": sql,
             "hidden": [*HIDDEN, "sqlite_dbpage"],
+            "private": PRIVATE if private else {},
             "seconds": limit_s,
             "grace": GRACE_S + _SELF_DESTRUCTION_S,
             "memory": MEMORY,

@@ -15,6 +15,8 @@ from semdb.errors import UsageError
 FIRST_WORDS = ("SELECT", "WITH", "EXPLAIN", "VALUES", "SHOW", "DESCRIBE", "DESC", "TABLE")
 HIDDEN = ("access_tokens", "service_jobs")
 """Tables that nobody reads with a statement of his own."""
+PRIVATE = {"recordings": "source", "ingest_items": "error", "queries": "image", "recording_findings": "message"}
+"""Columns that may tell of files and folders, by table."""
 _COMMENT = re.compile(r"\s+|--[^\n]*(?:\n|$)|#[^\n]*(?:\n|$)|/\*(?!M?!).*?\*/", re.DOTALL)
 # In this order; the mode of our sessions knows escapes with a backslash, and no names in double quotes.
 _TOKEN = re.compile(
@@ -43,15 +45,19 @@ def check_reads(sql: str) -> None:
         raise UsageError(f"only queries can be run here ({', '.join(FIRST_WORDS[:2])} ...), not {shown!r}")
 
 
-def check_hidden(sql: str) -> None:
+def check_hidden(sql: str, *, private: bool = False) -> None:
     """Raises UsageError for a statement for a server that names a hidden table, in whatever quotes and letters.
 
-    Without its name no SELECT reaches it: nothing in one makes names of texts.
+    Without its name no SELECT reaches it: nothing in one makes names of texts. With `private` the tables with private
+    columns may not be named either: which of their columns a statement reads cannot be told from here.
     """
     plain = unicodedata.normalize("NFKC", sql).casefold()
     for name in HIDDEN:
         if name in plain:
             raise UsageError(f"{name} is not shown here")
+    for name in PRIVATE if private else ():
+        if re.search(rf"(?<!\w){name}(?!\w)", plain):
+            raise UsageError(f"{name} is not shown here, since it tells where files lie; views name recordings, too")
 
 
 def check_limits(sql: str) -> None:

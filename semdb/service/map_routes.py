@@ -193,6 +193,17 @@ def place(x: float | None, y: float | None, z: float | None) -> tuple[float, flo
     return x, y, z
 
 
+@table.route("GET", "/v1/maps/{map}/changes", READ, schemas.ChangesModel)
+async def get_changes(
+    request: Request,
+    map: MapName,
+    before: Annotated[str, Query(min_length=1, max_length=255, description="a recording", examples=["monday"])],
+    after: Annotated[str, Query(min_length=1, max_length=255, description="a later one", examples=["friday"])],
+) -> Response:
+    """What appeared, disappeared and moved from one recording of a map to another one."""
+    return as_json((await read(request, lambda db: db.changes(before, after, map))).as_dict())
+
+
 @table.route("GET", "/v1/maps/{map}/loops", READ, schemas.Page[schemas.Link])
 async def list_loops(
     request: Request,
@@ -218,7 +229,9 @@ async def list_queries(
     """What was localized in a map, the newest first."""
     most = limit or service_of(request).settings.page
     found = await read(request, lambda db: db.queries(map, before=before, limit=most + 1))
-    return page_of(request, found, most, lambda one: one.id, values.query_dict, by="before")
+    with_path = access_of(request).has(ADMIN)
+    shown = [(one.id, values.query_dict(one, with_path=with_path)) for one in found]
+    return page_of(request, shown, most, lambda one: one[0], lambda one: one[1], by="before")
 
 
 @table.route("GET", "/v1/maps/{map}/coverage", READ, schemas.CoverageModel)

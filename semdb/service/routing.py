@@ -82,4 +82,7 @@ class Table:
 
 def _problem(code: int) -> dict[str, Any]:
     schema = {"$ref": f"#/components/schemas/{schemas.Problem.__name__}"}
-    return {"description": TITLES.get(code, "Error"), "content": {MEDIA_TYPE: {"schema": schema}}}
+    content: dict[str, Any] = {MEDIA_TYPE: {"schema": schema}}
+    if code == 400:  # of what is no HTTP the web server says so itself
+        content["text/plain"] = {"schema": {"type": "string"}}
+    return {"description": TITLES.get(code, "Error"), "content": content}

@@ -272,6 +272,10 @@ class Found(Model):
     missing: dict[str, Any] | None
 
 
+class ChangesModel(Model):
+    """What changed between two recordings, as `semdb changes --json` prints it."""
+
+
 class Link(Model):
     """What ties two keyframes together."""
 

@@ -15,7 +15,7 @@ from semdb.jsonable import to_jsonable
 from semdb.service import schemas
 from semdb.service.answers import as_json
 from semdb.service.problems import Problem, scrubbed
-from semdb.service.roles import READ
+from semdb.service.roles import ADMIN, READ
 from semdb.service.routing import Table
 from semdb.service.settings import MIB
 from semdb.service.state import Service, access_of, read, service_of
@@ -39,11 +39,12 @@ async def get_sql(
 ) -> Response:
     """Rows of one SELECT: read-only, for a limited time, a limited number of them, as JSON or CSV.
 
-    Bytes are hex. The header Semdb-Truncated says whether rows were left out. Only for tokens of all maps.
+    Where files lie is only for role admin: such columns are null, and of a server their tables are refused. Bytes are
+    hex. The header Semdb-Truncated says whether rows were left out. Only for tokens of all maps.
     """
     for_all_maps(request)
-    service = service_of(request)
-    columns, rows, truncated = await service.statements.run(lambda: _ask(service, sql))
+    service, private = service_of(request), not access_of(request).has(ADMIN)
+    columns, rows, truncated = await service.statements.run(lambda: _ask(service, sql, private))
     headers = {TRUNCATED: "true" if truncated else "false"}
     wanted = format or ("csv" if "text/csv" in request.headers.get("accept", "") else "json")
     if wanted == "csv":
@@ -51,10 +52,10 @@ async def get_sql(
     return as_json({"columns": columns, "rows": rows, "truncated": truncated}, headers=headers)
 
 
-def _ask(service: Service, sql: str) -> tuple[list[str], list[list[Any]], bool]:
+def _ask(service: Service, sql: str, private: bool) -> tuple[list[str], list[list[Any]], bool]:
     """Columns, rows, and whether there were more. Raises Problem 422."""
     try:
-        with service.database.sql(sql) as found:
+        with service.database.sql(sql, private=private) as found:
             columns = [str(name) for name in found.columns]
             rows, truncated = _some(iter(found), service.settings.sql_rows, int(service.settings.sql_mb * MIB))
             return columns, rows, truncated

@@ -179,13 +179,13 @@ def link_dict(found: KeyframeLink) -> dict[str, Any]:
     }
 
 
-def query_dict(found: LoggedQuery) -> dict[str, Any]:
+def query_dict(found: LoggedQuery, *, with_path: bool) -> dict[str, Any]:
     """A localization that was logged."""
     pose = found.world_from_camera
     return {
         "id": found.id,
         "created_at": f"{found.created_at.isoformat()}Z",
-        "image": found.image,
+        "image": found.image if with_path else found.image.rpartition("/")[2],
         "verdict": found.verdict,
         "pose": None if pose is None else pose_dict(pose),
         "confidence": found.confidence,

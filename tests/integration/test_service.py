@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import json
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -248,3 +250,22 @@ def test_a_session_by_http_and_over_a_connection(served: Served, frames: list[Fr
         connect(address, origin="https://evil.example")
     assert served.client.post("/v1/maps/office/sessions", json={"depth": 1}).status_code == 422
     assert served.client.post("/v1/maps/attic/sessions", json={}).status_code == 404
+
+
+def test_many_clients_at_once(served: Served, frames: list[Frame]) -> None:
+    form, files = form_of(frames[6])
+    alone = time.perf_counter()
+    wanted = untimed(served.client.post("/v1/maps/office/localize", data=form, files=files).json())
+    alone = time.perf_counter() - alone
+
+    def ask(_: int) -> tuple[int, str, float]:
+        started = time.perf_counter()
+        answer = served.client.post("/v1/maps/office/localize", data=form, files=files)
+        return answer.status_code, untimed(answer.json()), time.perf_counter() - started
+
+    with ThreadPoolExecutor(20) as pool:
+        found = list(pool.map(ask, range(20)))
+    assert {status for status, _, _ in found} == {200}
+    assert {answer for _, answer, _ in found} == {wanted}
+    assert max(seconds for _, _, seconds in found) < 25 * max(alone, 0.1)
+    assert served.service.localizing.inside == 0
