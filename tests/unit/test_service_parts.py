@@ -90,8 +90,8 @@ def test_run_lengths_are_cocos() -> None:
 @pytest.mark.parametrize(
     ("said", "told"),
     [
-        ("there is no map 'x' in sqlite:////home/me/a.sqlite3; maps: office, attic", "there is no map 'x'"),
-        ("/home/me/a.png: is not an image", "...: is not an image"),
+        ("there is no map 'x' in sqlite:////data/me/a.sqlite3; maps: office, attic", "there is no map 'x'"),
+        ("/data/me/a.png: is not an image", "...: is not an image"),
         ("open ~/x/y or ../up/z now", "open ... or ... now"),
         ("mysql+pymysql://me:secret@host:3306/db refused", "... refused"),
         ("1/2 of them, a/b and 3 m/s", "1/2 of them, a/b and 3 m/s"),
