@@ -118,6 +118,11 @@ METHODS = {
             "as semdb without laying the depth of queries on the map's surfaces",
             LocalizerOptions(surfaces=None),
         ),
+        Method(
+            "semdb-no-edges",
+            "as semdb without laying the edges of queries on those of the map",
+            LocalizerOptions(edges=None),
+        ),
         Method("hard", "as semdb with the hard class filter alone", LocalizerOptions(coarse=_HARD)),
         Method(
             "cnn-objects",

@@ -19,13 +19,14 @@ from semdb.errors import CodecError, FrameError, NotFoundError
 from semdb.geometry import POSE_UNIT_M, pose_distances
 from semdb.geometry.sensor import depth_noise
 from semdb.localization.coarse import MapChange
+from semdb.localization.edges import PlacedEdges
+from semdb.localization.shape_cache import Local, ShapeCache, There, edge_cache, surface_cache
 from semdb.localization.surface_alignment import PlacedSurfaces
-from semdb.localization.surface_cache import SurfaceCache
 from semdb.localization.views import ClassNumbers, KeyframeView, make_keyframe_view
 from semdb.recordings.images import decode_color_grey, has_size
 from semdb.types import Float32Array, FloatArray, ImageArray, Keypoints
 
-FAR_SURFACES = 12.0  # of `pose_distances`: keyframes further off show nothing that a query could lie on
+FAR_SHAPES = 12.0  # of `pose_distances`: keyframes further off show nothing that a query could lie on
 USED, STALE, NONE, OFF = "used", "stale", "none", "off"  # what becomes of its points
 
 
@@ -46,7 +47,7 @@ class KeyframeCache:
         self._names: dict[int, tuple[str, int]] = {}
         self._poses: tuple[list[int], FloatArray] | None = None
         self._stale: set[int] = set()  # keyframes whose poses are to be read again
-        self._surfaces = SurfaceCache(store)
+        self._surfaces, self._edges = surface_cache(store), edge_cache(store)
         self._refined = refined
         self._points: str | None = None if refined else OFF
         self.left_out: dict[int, CodecError] = {}  # keyframes that cannot be used
@@ -70,7 +71,8 @@ class KeyframeCache:
             if self._points == USED:
                 self._views.clear()  # their points belong to the map as it was
             self._points = None
-        self._surfaces.forget(None if change.everything else change.added | change.gone)
+        for shapes in (self._surfaces, self._edges):
+            shapes.forget(None if change.everything else change.added | change.gone)
         if change.everything:
             self._views.clear()
             self._names.clear()
@@ -184,13 +186,20 @@ class KeyframeCache:
 
     def surfaces_near(self, pose: FloatArray, count: int) -> list[PlacedSurfaces]:
         """Surfaces of the `count` keyframes nearest to `pose` that have depth, or fewer, in the world."""
+        return self._shapes_near(self._surfaces, pose, count)
+
+    def edges_near(self, pose: FloatArray, count: int) -> list[PlacedEdges]:
+        """Edges of the `count` keyframes nearest to `pose` that have depth, or fewer, in the world."""
+        return self._shapes_near(self._edges, pose, count)
+
+    def _shapes_near(self, shapes: ShapeCache[Local, There], pose: FloatArray, count: int) -> list[There]:
         with self._turn:
-            ids, poses = self.near(pose, FAR_SURFACES, (), 2 * count)
-            placed: list[PlacedSurfaces] = []
+            ids, poses = self.near(pose, FAR_SHAPES, (), 2 * count)
+            placed: list[There] = []
             for keyframe_id, world_from_camera in zip(ids, poses, strict=True):
-                surfaces = self._surfaces.placed(keyframe_id, world_from_camera)
-                if surfaces is not None:
-                    placed.append(surfaces)
+                found = shapes.placed(keyframe_id, world_from_camera)
+                if found is not None:
+                    placed.append(found)
                 if len(placed) == count:
                     break
             return placed

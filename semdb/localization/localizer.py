@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from semdb.class_score import ClassQuery, strengths
+from semdb.class_score import strengths
 from semdb.database.planning import check_models
 from semdb.errors import NotFoundError
 from semdb.localization.coarse import (
@@ -17,14 +17,17 @@ from semdb.localization.coarse import (
     CoarseSource,
     Proposal,
     QueryClasses,
-    Scored,
     Stage,
     cascade,
     query_classes,
     retrieve,
 )
 from semdb.localization.confidence import Evidence, gather_evidence
+from semdb.localization.edge_alignment import measure_edges, search_edges
+from semdb.localization.edge_step import EdgeVerdictOptions, weigh_edges
+from semdb.localization.edges import image_edges
 from semdb.localization.keyframe_cache import KeyframeCache
+from semdb.localization.laid_pose import LaidOptions, LaidPose, estimate_with, judge_with, may_overrule
 from semdb.localization.matching import Matches
 from semdb.localization.neighbours import by_side
 from semdb.localization.pose import (
@@ -36,16 +39,9 @@ from semdb.localization.pose import (
     rival_pose,
 )
 from semdb.localization.pose_options import PoseOptions
-from semdb.localization.surface_alignment import SurfaceOptions
+from semdb.localization.sources import TimedSource
 from semdb.localization.surface_search import search_surfaces
-from semdb.localization.surface_step import (
-    LaidPose,
-    SurfaceVerdictOptions,
-    estimate_with_surfaces,
-    judge_with_surfaces,
-    may_overrule,
-    weigh,
-)
+from semdb.localization.surface_step import SurfaceVerdictOptions, weigh_surfaces
 from semdb.localization.surfaces import Surfaces, surfaces_of
 from semdb.localization.verdict import Judgement, VerdictOptions, convinces, judge
 from semdb.localization.views import KeyframeView, View, make_view
@@ -66,6 +62,7 @@ class LocalizerOptions:
     twins: int = 1  # keyframes far from the pose that are asked when they look as much like the query
     refined_points: bool = True  # those of `semdb refine`, where the map has not changed since
     surfaces: SurfaceVerdictOptions | None = field(default_factory=SurfaceVerdictOptions)  # of a query with depth
+    edges: EdgeVerdictOptions | None = field(default_factory=EdgeVerdictOptions)  # where neither convinces
     twin_cosine: float = 0.05  # how much less than the best keyframe's cosine is "as much"
 
     def with_threads(self, threads: int) -> LocalizerOptions:
@@ -79,7 +76,7 @@ class _Search:
 
     query: View
     keyframes_in_map: int
-    laid: LaidPose | None = None
+    laid: list[LaidPose] = field(default_factory=list)
     keyframes: list[KeyframeView] = field(default_factory=list)
     matches: list[Matches] = field(default_factory=list)
     proposals: list[Proposal] = field(default_factory=list)
@@ -121,7 +118,7 @@ class Localizer:
         where none that can be used is found among damaged ones.
         """
         search = _Search(self._view_of(description), self._check(description))
-        source = _TimedSource(self.source)
+        source = TimedSource(self.source)
         started = time.perf_counter()
         for batch in cascade(source, self._classes(description), description.cnn_vector, self.options.coarse):
             search.timing_ms["rank"] += _ms_since(started)
@@ -202,39 +199,65 @@ class Localizer:
         evidence = None if search.estimate is None else _evidence(search, search.estimate, rival)
         judgement = judge(evidence, self.options.verdict)
         if not convinced or judgement.verdict is not Verdict.LOCALIZED:
-            judgement, evidence = self._with_surfaces(search, description, convinced, judgement, evidence)
+            for lay, options in ((self._lay_surfaces, self.options.surfaces), (self._lay_edges, self.options.edges)):
+                laid = lay(search, description) if search.keyframes else None
+                if laid is None or options is None:
+                    continue
+                judgement, evidence = self._with_laid(search, laid, options, convinced, judgement, evidence)
+                if laid.is_sure:
+                    break
         search.timing_ms["pose"] += _ms_since(started)
         return self._result(search, judgement, evidence)
 
-    def _with_surfaces(
+    def _with_laid(
         self,
         search: _Search,
-        description: Description,
+        laid: LaidPose,
+        options: LaidOptions,
         convinced: bool,
         judgement: Judgement,
         evidence: Evidence | None,
     ) -> tuple[Judgement, Evidence | None]:
-        """Verdict and evidence after a query's depth was laid on the map, where it has depth; the pose with them."""
-        options = self.options.surfaces
-        surfaces = self._surfaces_of(description) if options is not None and search.keyframes else None
-        if options is None or surfaces is None:
-            return judgement, evidence
-        starts, fit = self._starts(search, options.fit), options.fit
-        fits = search_surfaces(surfaces, starts, lambda pose: self.cache.surfaces_near(pose, fit.keyframes), fit)
-        bounds = self.options.verdict
-        limits = (bounds.maximum_translation_sigma_m, bounds.maximum_rotation_sigma_deg)
-        laid = weigh(fits, search.query, search.keyframes, search.matches, options, limits)
-        if laid is None:
-            return judgement, evidence
-        search.laid, before, overrule = laid, search.estimate, False
+        """Verdict and evidence after a query was laid on the map; the pose with them."""
+        before, overrule = search.estimate, False
+        search.laid.append(laid)
         if laid.is_sure:
             pose = self.options.pose
-            found = estimate_with_surfaces(laid, search.query, search.keyframes, search.matches, options, pose)
+            found = estimate_with(laid, search.query, search.keyframes, search.matches, options, pose)
             anew = _evidence(search, found, 0)
             overrule = may_overrule(convinced, anew, options)
             if overrule:
                 search.estimate, evidence = found, anew
-        return judge_with_surfaces(judgement, before, laid, options, overrule), evidence
+        return judge_with(judgement, before, laid, options, overrule), evidence
+
+    def _lay_surfaces(self, search: _Search, description: Description) -> LaidPose | None:
+        """The pose of a query's depth on the surfaces of the map, where it has depth."""
+        options = self.options.surfaces
+        surfaces = None if options is None else self._surfaces_of(description)
+        if options is None or surfaces is None:
+            return None
+        starts, fit = self._starts(search, options.fit.starts), options.fit
+        fits = search_surfaces(surfaces, starts, lambda pose: self.cache.surfaces_near(pose, fit.keyframes), fit)
+        return weigh_surfaces(fits, search.query, search.keyframes, search.matches, options, self._limits())
+
+    def _lay_edges(self, search: _Search, description: Description) -> LaidPose | None:
+        """The pose of a query's edges on those of the map."""
+        options = self.options.edges
+        if options is None or description.grey is None:
+            return None
+        starts, fit = self._starts(search, options.fit.starts), options.fit
+        edges = image_edges(description.camera, description.grey)
+        fits = search_edges(edges, starts, lambda pose: self.cache.edges_near(pose, fit.keyframes), fit)
+        own = None
+        if search.estimate is not None:
+            pose = search.estimate.world_from_camera
+            own = measure_edges(edges, self.cache.edges_near(pose, fit.keyframes), pose, fit.fine[-1])
+        return weigh_edges(fits, own, search.query, search.keyframes, search.matches, options, self._limits())
+
+    def _limits(self) -> tuple[float, float]:
+        """What standard deviations (m, deg) a pose may have that is sure."""
+        bounds = self.options.verdict
+        return bounds.maximum_translation_sigma_m, bounds.maximum_rotation_sigma_deg
 
     def _surfaces_of(self, description: Description) -> Surfaces | None:
         """Those of a query, where it has depth that may be used."""
@@ -242,15 +265,15 @@ class Localizer:
             return None
         return surfaces_of(description.camera, description.depth, description.grey)
 
-    def _starts(self, search: _Search, options: SurfaceOptions) -> list[FloatArray]:
-        """Poses from which surfaces are laid: that of the keypoints, and those of the likeliest keyframes."""
+    def _starts(self, search: _Search, keyframes: int) -> list[FloatArray]:
+        """Poses from which a query is laid: that of the keypoints, and those of the likeliest keyframes."""
         estimate = search.estimate
         order = list(range(len(search.keyframes)))
         if estimate is not None:
             counts = [*estimate.per_keyframe, *[0] * (len(order) - len(estimate.per_keyframe))]
             order.sort(key=lambda slot: -counts[slot])
         starts = [] if estimate is None else [estimate.world_from_camera]
-        return starts + [search.keyframes[slot].world_from_camera for slot in order[: options.starts]]
+        return starts + [search.keyframes[slot].world_from_camera for slot in order[:keyframes]]
 
     def _ask_neighbours(self, search: _Search) -> None:
         """Keyframes near the first pose see the same things from elsewhere: their pairs steady the pose."""
@@ -320,7 +343,7 @@ class Localizer:
             keyframes_matched=len(search.keyframes),
             reason=judgement.reason,
             timing_ms=search.timing_ms,
-            evidence=(evidence.as_mapping() if evidence else {}) | (search.laid.as_mapping() if search.laid else {}),
+            evidence=_numbers(search, evidence),
             refinements={"points": self.cache.points},
             best_keyframe_id=best,
             query_xy=query_xy,
@@ -341,28 +364,12 @@ class Localizer:
         )
 
 
-class _TimedSource:
-    """A source for one query that adds up the time of the class filter."""
-
-    def __init__(self, source: CoarseSource) -> None:
-        self._source = source
-        self.refresh = source.refresh
-        self.keyframe_count = source.keyframe_count
-        self.cosines = source.cosines
-        self.nearest = source.nearest
-        self.filter_ms = 0.0
-
-    def document_frequencies(self, categories: Collection[str]) -> dict[str, int]:
-        started = time.perf_counter()
-        found = self._source.document_frequencies(categories)
-        self.filter_ms += _ms_since(started)
-        return found
-
-    def filtered(self, query: ClassQuery, minimum_share: float, at_most: int | None) -> Scored:
-        started = time.perf_counter()
-        found = self._source.filtered(query, minimum_share, at_most)
-        self.filter_ms += _ms_since(started)
-        return found
+def _numbers(search: _Search, evidence: Evidence | None) -> dict[str, float]:
+    """All evidence, of keypoints and of what was laid."""
+    found = evidence.as_mapping() if evidence else {}
+    for laid in search.laid:
+        found |= laid.numbers
+    return found
 
 
 def _evidence(search: _Search, estimate: PoseEstimate, rival: int) -> Evidence:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Collection
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from semdb.class_score import ClassQuery
 from semdb.database.store import Store
 from semdb.localization.changes import ChangeReader, summary_of
-from semdb.localization.coarse import MapChange, Ranked, Scored
+from semdb.localization.coarse import CoarseSource, MapChange, Ranked, Scored
 from semdb.localization.ranking import best_first, exact_cosines
 from semdb.types import Float32Array, FloatArray, Int64Array
 
@@ -79,3 +80,27 @@ class SqlSource:
             order = best_first(both.keyframe_ids, both.cosines + class_weight * both.class_scores, count)
             best = Ranked(both.keyframe_ids[order], both.class_scores[order], both.cosines[order])
         return best
+
+
+class TimedSource:
+    """A source for one query that adds up the time of the class filter."""
+
+    def __init__(self, source: CoarseSource) -> None:
+        self._source = source
+        self.refresh = source.refresh
+        self.keyframe_count = source.keyframe_count
+        self.cosines = source.cosines
+        self.nearest = source.nearest
+        self.filter_ms = 0.0
+
+    def document_frequencies(self, categories: Collection[str]) -> dict[str, int]:
+        started = time.perf_counter()
+        found = self._source.document_frequencies(categories)
+        self.filter_ms += 1000 * (time.perf_counter() - started)
+        return found
+
+    def filtered(self, query: ClassQuery, minimum_share: float, at_most: int | None) -> Scored:
+        started = time.perf_counter()
+        found = self._source.filtered(query, minimum_share, at_most)
+        self.filter_ms += 1000 * (time.perf_counter() - started)
+        return found

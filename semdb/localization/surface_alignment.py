@@ -196,7 +196,7 @@ def _fit(pose: FloatArray, matrices: FloatArray, gradients: FloatArray, counts: 
     return SurfaceFit(
         world_from_camera=pose,
         information=matrices.sum(axis=0),
-        scatter=_scatter(matrices, gradients),
+        scatter=scatter_of(matrices, gradients),
         seen=seen,
         near=float(total[NEAR] / seen),
         alike=float(total[ALIKE] / seen),
@@ -207,7 +207,7 @@ def _fit(pose: FloatArray, matrices: FloatArray, gradients: FloatArray, counts: 
     )
 
 
-def _scatter(matrices: FloatArray, gradients: FloatArray) -> FloatArray:
+def scatter_of(matrices: FloatArray, gradients: FloatArray) -> FloatArray:
     """Covariance ``[6, 6]`` of the pose from how it moves without each of the keyframes in turn (the jackknife).
 
     Keyframes' recorded poses are off by more than the noise of thousands of points. Efron, The jackknife, the bootstrap

@@ -1,26 +1,17 @@
-"""A query's depth laid on surfaces: exact in a corner, honest on a bare wall, undecided where it fits twice."""
+"""A query's depth laid on surfaces: exact in a corner, honest on a bare wall."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from semdb.geometry import invert_pose, pose_error, so3_exp
+from semdb.geometry import pose_error, so3_exp
 from semdb.localization.confidence import sigmas
-from semdb.localization.pairs import join_pairs
-from semdb.localization.pose import PoseEstimate
 from semdb.localization.surface_alignment import PlacedSurfaces, SurfaceFit, SurfaceOptions, distinct, place
 from semdb.localization.surface_search import search_surfaces
-from semdb.localization.surface_step import (
-    LaidPose,
-    SurfaceVerdictOptions,
-    covariance_of,
-    fused,
-    judge_with_surfaces,
-)
+from semdb.localization.surface_step import covariance_of
 from semdb.localization.surfaces import surfaces_of
-from semdb.localization.verdict import Judgement
-from semdb.types import Camera, Float32Array, FloatArray, ImageArray, Verdict
+from semdb.types import Camera, Float32Array, FloatArray, ImageArray
 
 CAMERA = Camera(320, 240, 262.0, 262.0, 159.5, 119.5)
 PLANES = (  # normals and offsets of a corner of a room: floor, two walls
@@ -126,41 +117,3 @@ def fit_at(shift: float, near: float = 0.9, through: float = 0.0) -> SurfaceFit:
 def test_fits_of_one_pose_are_one() -> None:
     groups = distinct([fit_at(0.0, 0.8), fit_at(1.0), fit_at(0.01, 0.85)])
     assert [[fit.near for fit in group] for group in groups] == [[0.9], [0.85, 0.8]]
-
-
-def laid(doubts: tuple[str, ...], near: float = 0.9) -> LaidPose:
-    fit = fit_at(0.0, near)
-    return LaidPose(fit, covariance_of(fit), 12, 0, doubts)
-
-
-def estimate_at(shift: float) -> PoseEstimate:
-    pairs = join_pairs([])
-    return PoseEstimate(pose((shift, 0, 0), (0, 0, 0)), None, pairs, 60, (60,), 30, 30, 0.6, 1.0, 0.5)
-
-
-@pytest.mark.parametrize(
-    ("doubts", "near", "shift", "before", "after"),
-    [
-        ((), 0.9, 0.0, Verdict.AMBIGUOUS, Verdict.LOCALIZED),
-        ((), 0.9, 0.3, Verdict.LOCALIZED, Verdict.LOCALIZED),
-        (("few",), 0.9, 0.0, Verdict.LOCALIZED, Verdict.LOCALIZED),  # they say the same
-        (("few",), 0.9, 0.3, Verdict.LOCALIZED, Verdict.AMBIGUOUS),  # the depth contradicts
-        (("few",), 0.3, 0.3, Verdict.LOCALIZED, Verdict.LOCALIZED),  # the depth fits nowhere
-        (("few",), 0.9, 0.0, Verdict.FAILED, Verdict.FAILED),
-    ],
-)
-def test_what_becomes_of_a_verdict(
-    doubts: tuple[str, ...], near: float, shift: float, before: Verdict, after: Verdict
-) -> None:
-    options = SurfaceVerdictOptions()
-    judgement = judge_with_surfaces(Judgement(before, 0.9, ""), estimate_at(shift), laid(doubts, near), options, True)
-    assert judgement.verdict is after
-    assert (judgement.confidence <= 0.5) == (after is Verdict.AMBIGUOUS)
-
-
-def test_two_estimates_in_one_lie_between_them() -> None:
-    one, two = pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), pose((0.04, 0.0, 0.0), (0.0, 2.0, 0.0))
-    found, covariance = fused(one, np.eye(6) * 3e-4, two, np.eye(6) * 1e-4)
-    np.testing.assert_allclose(found[:3, 3], [0.03, 0, 0], atol=1e-9)
-    assert pose_error(found, invert_pose(invert_pose(pose((0.03, 0, 0), (0, 1.5, 0)))))[1] < 1e-6
-    np.testing.assert_allclose(covariance, np.eye(6) * 0.75e-4, atol=1e-12)

@@ -1,0 +1,84 @@
+"""What a pose found by laying a query on the map makes of the verdict of keypoints."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from semdb.geometry import pose_error, so3_exp
+from semdb.localization.confidence import sigmas
+from semdb.localization.laid_pose import (
+    LaidOptions,
+    LaidPose,
+    Standing,
+    covariance_from,
+    fused,
+    judge_with,
+    shared_doubts,
+)
+from semdb.localization.pairs import join_pairs
+from semdb.localization.pose import PoseEstimate
+from semdb.localization.verdict import Judgement
+from semdb.types import FloatArray, Verdict
+
+
+def pose(shift: tuple[float, float, float], turn_deg: tuple[float, float, float]) -> FloatArray:
+    made = np.eye(4)
+    made[:3, :3], made[:3, 3] = so3_exp(np.radians(turn_deg)), shift
+    return made
+
+
+def laid(doubts: tuple[str, ...], fits_well: bool = True) -> LaidPose:
+    return LaidPose(np.eye(4), np.eye(6) * 1e-4, 12, 0, doubts, fits_well, "90 % of it", "better elsewhere", {})
+
+
+def estimate_at(shift: float) -> PoseEstimate:
+    pairs = join_pairs([])
+    return PoseEstimate(pose((shift, 0, 0), (0, 0, 0)), None, pairs, 60, (60,), 30, 30, 0.6, 1.0, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("doubts", "fits_well", "shift", "before", "after"),
+    [
+        ((), True, 0.0, Verdict.AMBIGUOUS, Verdict.LOCALIZED),
+        ((), True, 0.3, Verdict.LOCALIZED, Verdict.LOCALIZED),
+        (("few",), True, 0.0, Verdict.LOCALIZED, Verdict.LOCALIZED),  # they say the same
+        (("few",), True, 0.3, Verdict.LOCALIZED, Verdict.AMBIGUOUS),  # what is laid contradicts
+        (("few",), False, 0.3, Verdict.LOCALIZED, Verdict.LOCALIZED),  # it fits nowhere
+        (("few",), True, 0.0, Verdict.FAILED, Verdict.FAILED),
+    ],
+)
+def test_what_becomes_of_a_verdict(
+    doubts: tuple[str, ...], fits_well: bool, shift: float, before: Verdict, after: Verdict
+) -> None:
+    judgement = judge_with(Judgement(before, 0.9, ""), estimate_at(shift), laid(doubts, fits_well), LaidOptions(), True)
+    assert judgement.verdict is after
+    assert (judgement.confidence <= 0.5) == (after is Verdict.AMBIGUOUS)
+
+
+def test_doubts_say_what_is_free_and_what_fits_elsewhere() -> None:
+    covariance = np.diag([0.16, 1e-4, 1e-4, 1e-6, 1e-6, 1e-6])
+    found = shared_doubts(covariance, Standing(0, 5, 4), LaidOptions(), (0.06, 1.5), "edges")
+    assert found == [
+        "only 5 keypoints vouch for where the edges fit",
+        "a pose elsewhere fits too, with 4 against 5 keypoints",
+        "the edges leave the pose free by 0.40 m and 0.1 deg",
+    ]
+    assert shared_doubts(np.eye(6) * 1e-6, Standing(0, 6, 0), LaidOptions(), (0.06, 1.5), "edges") == []
+
+
+def test_many_measurements_are_not_believed_to_be_independent() -> None:
+    information = np.eye(6) * 1e8
+    sigma_m, sigma_deg = sigmas(covariance_from(information, np.zeros((6, 6)), 60.0))
+    assert sigma_m == pytest.approx(0.006, rel=0.01)  # what keyframes share is left
+    assert sigma_deg == pytest.approx(np.degrees(0.007), rel=0.01)
+    apart = np.diag([0.02**2, 0, 0, 0, 0, 0])
+    assert sigmas(covariance_from(information, apart, 60.0))[0] == pytest.approx(0.0404, rel=0.01)
+
+
+def test_two_estimates_in_one_lie_between_them() -> None:
+    one, two = pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), pose((0.04, 0.0, 0.0), (0.0, 2.0, 0.0))
+    found, covariance = fused(one, np.eye(6) * 3e-4, two, np.eye(6) * 1e-4)
+    np.testing.assert_allclose(found[:3, 3], [0.03, 0, 0], atol=1e-9)
+    assert pose_error(found, pose((0.03, 0, 0), (0, 1.5, 0)))[1] < 1e-6
+    np.testing.assert_allclose(covariance, np.eye(6) * 0.75e-4, atol=1e-12)
