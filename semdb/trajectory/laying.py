@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from semdb.localization.laid_pose import estimate_with
 from semdb.localization.pose import match_views
 from semdb.localization.surface_search import search_surfaces
-from semdb.localization.surface_step import estimate_with_surfaces, weigh
+from semdb.localization.surface_step import weigh_surfaces
 from semdb.trajectory.frames import SeenFrame
 from semdb.trajectory.keyframes import Keyframes
 from semdb.trajectory.options import TrajectoryOptions
@@ -38,8 +39,8 @@ def lay(
     views = [keyframes.view_of(number) for number in numbers]
     matches = match_views(frame.view, views, options.pose)
     limits = options.tracking.most_sigma_m, options.tracking.most_sigma_deg
-    laid = weigh(fits, frame.view, views, matches, chosen, limits)
+    laid = weigh_surfaces(fits, frame.view, views, matches, chosen, limits)
     if laid is None or not laid.is_sure:
         return None
-    estimate = estimate_with_surfaces(laid, frame.view, views, matches, chosen, options.pose)
+    estimate = estimate_with(laid, frame.view, views, matches, chosen, options.pose)
     return Placed(estimate, tuple(views), laid=True)
