@@ -142,11 +142,15 @@ def covariance_from(information: FloatArray, scatter: FloatArray, alike: float) 
     return np.asarray(np.linalg.inv(information / alike + loose) + np.diag(shared) + SCATTER * scatter)
 
 
-def may_overrule(convinced: bool, evidence: Evidence, options: LaidOptions) -> bool:
-    """Whether a sure laid pose stands against a doubtful verdict of keypoints.
+def may_overrule(convinced: bool, evidence: Evidence, laid: LaidPose, options: LaidOptions) -> bool:
+    """Whether a sure `laid` pose stands against a doubtful verdict of keypoints.
 
-    `evidence` is what keypoints say of that pose, `convinced` whether there were many.
+    `evidence` is what keypoints say of that pose, `convinced` whether there were many. Where a place is there twice
+    it does not: the other place has as many, though nothing may have been laid on it.
     """
+    own = evidence.first_of_best if convinced else laid.support  # once convinced, one keyframe elsewhere was asked
+    if evidence.rival > options.rival_alone * own:
+        return False
     return not convinced or (
         evidence.likeness >= options.convinced_likeness and confidence_of(evidence) >= options.convinced_confidence
     )

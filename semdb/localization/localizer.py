@@ -224,8 +224,9 @@ class Localizer:
         if laid.is_sure:
             pose = self.options.pose
             found = estimate_with(laid, search.query, search.keyframes, search.matches, options, pose)
-            anew = _evidence(search, found, 0)
-            overrule = may_overrule(convinced, anew, options)
+            rival = rival_pose(search.query, search.keyframes, search.matches, found, pose)
+            anew = _evidence(search, found, rival)
+            overrule = may_overrule(convinced, anew, laid, options)
             if overrule:
                 search.estimate, evidence = found, anew
         return judge_with(judgement, before, laid, options, overrule), evidence

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from semdb.geometry import pose_error, so3_exp
-from semdb.localization.confidence import sigmas
+from semdb.localization.confidence import Evidence, sigmas
 from semdb.localization.laid_pose import (
     LaidOptions,
     LaidPose,
@@ -14,6 +14,7 @@ from semdb.localization.laid_pose import (
     covariance_from,
     fused,
     judge_with,
+    may_overrule,
     shared_doubts,
 )
 from semdb.localization.pairs import join_pairs
@@ -82,3 +83,24 @@ def test_two_estimates_in_one_lie_between_them() -> None:
     np.testing.assert_allclose(found[:3, 3], [0.03, 0, 0], atol=1e-9)
     assert pose_error(found, pose((0.03, 0, 0), (0, 1.5, 0)))[1] < 1e-6
     np.testing.assert_allclose(covariance, np.eye(6) * 0.75e-4, atol=1e-12)
+
+
+def evidence(rival: int, likeness: float = 0.9) -> Evidence:
+    return Evidence(
+        120, 60, 40, 0.6, 0.7, 1.0, 0.01, 0.3, rival, 2, 20, 0.3, 0.4, 0.5, likeness, 0.6, 0.8, 0.5, 0, 0.9, 0.1
+    )
+
+
+@pytest.mark.parametrize(
+    ("convinced", "rival", "likeness", "stands"),
+    [
+        (True, 0, 0.9, True),
+        (True, 0, 0.4, False),  # many keypoints, and yet it looks otherwise: a room of the same shapes
+        (False, 0, 0.4, True),
+        (True, 29, 0.9, False),  # of 40 with the best keyframe: the place is there twice
+        (False, 8, 0.9, True),
+        (False, 9, 0.9, False),  # of 12 that vouch
+    ],
+)
+def test_when_a_laid_pose_stands_against_keypoints(convinced: bool, rival: int, likeness: float, stands: bool) -> None:
+    assert may_overrule(convinced, evidence(rival, likeness), laid(()), LaidOptions()) is stands
