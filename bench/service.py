@@ -71,14 +71,22 @@ def form_of(frame: Frame) -> tuple[dict[str, str], dict[str, Any]]:
     return form, files
 
 
-def in_turn(database: Any, client: httpx.Client, frames: list[Frame], queries: int) -> dict[str, float]:
-    """Milliseconds of the library here, of the service, and of what the service takes beside the library there."""
+def in_turn(database: Any, client: httpx.Client, pid: int, frames: list[Frame], queries: int) -> dict[str, float]:
+    """Milliseconds of the library here, of the service, and of what the service takes beside the library there.
+
+    Also of processor time, which other programs on the machine do not change much.
+    """
     library, service, beside = [], [], []
+    here, there = 0.0, 0.0
     for number in range(queries + 3):
         frame = replace(frames[number % len(frames)], depth=None)
         form, files = form_of(frame)
+        if number == 3:
+            here, there = 0.0, cpu_ms(pid)
+        own = time.process_time()
         started = time.perf_counter()
         database.localize(frame, map="bench", log=False)
+        here += 1000 * (time.process_time() - own)
         between = time.perf_counter()
         answer = client.post("/v1/maps/bench/localize", data=form, files=files)
         ended = time.perf_counter()
@@ -87,7 +95,7 @@ def in_turn(database: Any, client: httpx.Client, frames: list[Frame], queries: i
             library.append(1000 * (between - started))
             service.append(1000 * (ended - between))
             beside.append(service[-1] - answer.json()["timing_ms"]["total"])
-    found = {}
+    found = {"library_cpu_ms": here / queries, "service_cpu_ms": (cpu_ms(pid) - there) / queries}
     for name, values in (("library", library), ("service", service), ("overhead", beside)):
         found[f"{name}_p50_ms"], found[f"{name}_p95_ms"] = (float(np.percentile(values, q)) for q in (50, 95))
     return found
@@ -125,6 +133,12 @@ def under_load(url: str, frames: list[Frame], clients: int, seconds: float) -> d
     return {"clients": clients, "statuses": dict(statuses), "load_p95_ms": p95, "answers_per_s": rate}
 
 
+def cpu_ms(pid: int) -> float:
+    """Processor time of a process so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return 1000 * (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
 def memory_mib(pid: int) -> float:
     """What a process holds."""
     found = re.search(r"VmRSS:\s+(\d+)", Path(f"/proc/{pid}/status").read_text())
@@ -153,7 +167,7 @@ def main() -> None:
                 frames = [frame for number, frame in enumerate(recording.frames()) if number % 3 == 1][:20]
                 with served(url, folder, **models) as (client, pid):
                     result: dict[str, Any] = {"recording": path.name}
-                    result |= in_turn(database, client, frames, arguments.queries)
+                    result |= in_turn(database, client, pid, frames, arguments.queries)
                     before = memory_mib(pid)
                     load = under_load(str(client.base_url), frames, arguments.clients, arguments.seconds)
                     result |= load | {"memory_before_mib": before, "memory_after_mib": memory_mib(pid)}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
@@ -59,6 +61,7 @@ def make_api(service: Service) -> FastAPI:
     @asynccontextmanager
     async def life(_: FastAPI) -> AsyncIterator[None]:
         service.start_jobs()
+        _hear_of_the_end(service)
         yield
         service.close()
 
@@ -85,6 +88,21 @@ def make_api(service: Service) -> FastAPI:
     app.add_exception_handler(Exception, _on_anything)
     _document(app)
     return app
+
+
+def _hear_of_the_end(service: Service) -> None:
+    """Streams that never end by themselves end when the web server is told to stop, which waits for them."""
+    if threading.current_thread() is not threading.main_thread():
+        return
+    for number in (signal.SIGTERM, signal.SIGINT):
+        before = signal.getsignal(number)
+
+        def told(got: int, frame: Any, before: Any = before) -> None:
+            service.stopping = True
+            if callable(before):
+                before(got, frame)
+
+        signal.signal(number, told)
 
 
 def wrapped(app: FastAPI, service: Service) -> ASGIApp:

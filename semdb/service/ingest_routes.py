@@ -209,7 +209,7 @@ async def upload(
     return as_json({"upload": made.id, "name": name, "bytes": size}, 201)
 
 
-@table.route("POST", "/v1/uploads/live", INGEST, schemas.UploadModel, status=201)
+@table.route("POST", "/v1/uploads/live", INGEST, schemas.UploadModel, status=201, errors=(507,))
 async def live(request: Request, name: Annotated[str, Query(max_length=100, examples=["kitchen-3"])]) -> Response:
     """Opens an upload that takes frame by frame; `ingest` takes it when all are there."""
     service, access = service_of(request), access_of(request)
@@ -217,7 +217,7 @@ async def live(request: Request, name: Annotated[str, Query(max_length=100, exam
     return as_json({"upload": made.id, "name": name, "bytes": 0}, 201)
 
 
-@table.route("POST", "/v1/uploads/{upload_id}/frames", INGEST, schemas.UploadModel, status=201, errors=(409,))
+@table.route("POST", "/v1/uploads/{upload_id}/frames", INGEST, schemas.UploadModel, status=201, errors=(409, 507))
 async def add_frame(
     request: Request,
     upload_id: UploadId,
@@ -233,6 +233,7 @@ async def add_frame(
     """Adds a frame of a live session: colour, depth registered to it, and the pose where it is known."""
     service, access = service_of(request), access_of(request)
     found = service.uploads.find(upload_id, access.who, any_ones=access.has(ADMIN))
+    service.uploads.check_room()
     files = {"rgb": await image.read()}
     if depth is not None:
         files["depth"] = await depth.read()

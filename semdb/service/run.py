@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import secrets
+import signal
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -70,6 +71,7 @@ def serve_forever(settings: Settings, serve: ServeSettings) -> None:
     import uvicorn
 
     check(settings, serve)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # what the web server raises again when it has stopped
     options = {
         "host": serve.host,
         "port": serve.port,
@@ -81,6 +83,7 @@ def serve_forever(settings: Settings, serve: ServeSettings) -> None:
         "ssl_certfile": None if serve.tls_certificate is None else str(serve.tls_certificate),
         "ssl_keyfile": None if serve.tls_key is None else str(serve.tls_key),
         "ws_max_size": int(serve.max_upload_mb * 2**20),
+        "ws_max_queue": 2,  # a client that sends more waits
         "ws_ping_interval": 20.0,
         "h11_max_incomplete_event_size": 64 * 1024,
     }

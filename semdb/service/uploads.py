@@ -56,12 +56,19 @@ class Uploads:
         """A folder for what comes. Raises Problem 422 for a name that is none."""
         if not NAME.fullmatch(name):
             raise Problem(422, "a name of an upload is made of A-Z a-z 0-9 . _ -, 100 characters at most")
+        self.folder.mkdir(parents=True, exist_ok=True, mode=0o750)
+        self.check_room()
         found = Upload(secrets.token_hex(12), who, name, Path())
         folder = self.folder / found.id
         folder.mkdir(parents=True, mode=0o750)
         (folder / _CONTENT).mkdir()
         (folder / _ABOUT).write_text(json.dumps({"who": who, "name": name}), "utf-8")
         return Upload(found.id, who, name, folder)
+
+    def check_room(self) -> None:
+        """Raises Problem 507 where the disk is nearly full."""
+        if shutil.disk_usage(self.folder).free < ROOM_LEFT:
+            raise Problem(507, "there is no room for uploads")
 
     def find(self, name: str, who: str, *, any_ones: bool = False) -> Upload:
         """The upload of whoever asks. Raises Problem 404."""

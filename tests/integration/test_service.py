@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import socket
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -12,11 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import httpx
 import numpy as np
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+import semdb
 from semdb.api import Answer
 from semdb.jsonable import to_jsonable
 from semdb.service import values
@@ -227,20 +230,20 @@ def test_a_session_by_http_and_over_a_connection(served: Served, frames: list[Fr
     sent = {name: form[name] for name in ("name", "frame_index", "timestamp_ns")}
     assert untimed(served.client.post(opened.json()["frames"], data=sent, files=files).json()) == wanted
     address = f"ws{served.url.removeprefix('http')}{opened.json()['stream']}"
-    with connect(address) as socket:
+    with connect(address) as stream:
         for number in (1, 2):
             said = {"parts": ["image", "instances"], "name": "frame", "frame_index": 6}
-            socket.send(json.dumps(said | {"timestamp_ns": frames[6].timestamp_ns}))
+            stream.send(json.dumps(said | {"timestamp_ns": frames[6].timestamp_ns}))
             for part in said["parts"]:
-                socket.send(files[part][1])
-            answer = json.loads(socket.recv(timeout=60))
+                stream.send(files[part][1])
+            answer = json.loads(stream.recv(timeout=60))
             assert (answer.pop("sequence"), answer.pop("ms") > 0) == (number, True)
             assert untimed(answer) == wanted
-        socket.send(b"no picture")
-        assert json.loads(socket.recv(timeout=60))["status"] == 422
-        socket.send(json.dumps({"parts": ["image", "image"]}))
+        stream.send(b"no picture")
+        assert json.loads(stream.recv(timeout=60))["status"] == 422
+        stream.send(json.dumps({"parts": ["image", "image"]}))
         with pytest.raises(ConnectionClosed) as closed:
-            socket.recv(timeout=60)
+            stream.recv(timeout=60)
         assert (closed.value.rcvd.code, "expected as JSON" in closed.value.rcvd.reason) == (1008, True)
     for session in ("none", opened.json()["session"][:-4] + "AAAA"):
         assert served.client.post(f"/v1/sessions/{session}/frames", files=files).status_code == 404
@@ -269,3 +272,43 @@ def test_many_clients_at_once(served: Served, frames: list[Frame]) -> None:
     assert {answer for _, answer, _ in found} == {wanted}
     assert max(seconds for _, _, seconds in found) < 25 * max(alone, 0.1)
     assert served.service.localizing.inside == 0
+
+
+def test_more_than_there_are_places_for_come_again(served: Served, frames: list[Frame]) -> None:
+    form, files = form_of(frames[6])
+    other = semdb.open(served.database.settings.database_url, cache_dir=served.folder / "cache", threads=1)
+    with running(other, ServeSettings(pool=1, queue=1)) as small:
+
+        def ask(_: int) -> httpx.Response:
+            return small.client.post("/v1/maps/office/localize", data=form, files=files)
+
+        with ThreadPoolExecutor(8) as pool:
+            found = list(pool.map(ask, range(8)))
+        assert {answer.status_code for answer in found} == {200, 429}
+        for answer in found:
+            if answer.status_code == 429:
+                assert int(answer.headers["retry-after"]) >= 1
+                assert "come again" in answer.json()["detail"]
+        assert ask(0).status_code == 200
+
+
+def test_a_flood_over_a_connection_waits_its_turn(served: Served) -> None:
+    address = served.client.post("/v1/maps/office/sessions", json={}).json()["stream"]
+    with connect(f"ws{served.url.removeprefix('http')}{address}") as stream:
+        for _ in range(60):
+            stream.send(b"x" * 5000)
+        told = [json.loads(stream.recv(timeout=60)) for _ in range(60)]
+        assert [answer["sequence"] for answer in told] == list(range(1, 61))
+        assert {answer["status"] for answer in told} <= {422, 429}
+    assert served.service.localizing.inside == 0
+
+
+def test_who_takes_nothing_is_let_go(served: Served) -> None:
+    host, port = served.url.removeprefix("http://").split(":")
+    keyframe = served.database.keyframes("office")[0].id
+    with socket.create_connection((host, int(port)), timeout=30) as slow:
+        slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        request = f"GET /v1/keyframes/{keyframe}/depth?metres=1 HTTP/1.1\r\nHost: {host}\r\n\r\n".encode()
+        slow.sendall(request * 40)
+        for _ in range(20):  # others are answered meanwhile
+            assert served.client.get("/health").status_code == 200

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import stat
 import time
 import zipfile
@@ -174,6 +175,25 @@ def test_frames_of_a_live_session(served: Served, frames: list[Frame]) -> None:
     found = ended(served, job)
     assert found["state"] in ("done", "failed")
     assert found["error"] is None or "detector" in found["error"], found
+
+
+def test_what_is_old_is_forgotten(served: Served) -> None:
+    jobs, uploads = served.service.jobs, served.service.uploads
+    assert jobs is not None
+    served.database._store().ensure_map("office")
+    old, new = uploads.new("x", "old"), uploads.new("x", "new")
+    os.utime(old.folder, (0, 0))
+    with served.database._store().engine.begin() as connection:
+        for moment in ("2020-01-01 00:00:00", "2999-01-01 00:00:00"):
+            connection.exec_driver_sql(
+                "INSERT INTO queries (map_id, created_at, image, verdict, confidence, inliers, stage, reason,"
+                f" candidates, timing_ms) SELECT id, '{moment}', 'a', 'failed', 0, 0, 's', 'r', '[]', '{{}}' FROM maps"
+            )
+    before = len(served.database.queries("office"))
+    jobs._tidy()
+    assert len(served.database.queries("office")) == before - 1
+    assert (old.folder.exists(), new.folder.exists()) == (False, True)
+    uploads.drop(new)
 
 
 def test_jobs_have_leases_and_end(served: Served) -> None:
