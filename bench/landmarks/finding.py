@@ -40,9 +40,10 @@ def fill(store: Store, number: int, per_map: int = 1000) -> None:
         count = min(per_map, number - made)
         places = rng.uniform(-20, 20, (count, 3))
         zeros = dict.fromkeys(tables.COVARIANCE_COLUMNS, 0.0)
+        classes = [keys[int(rng.integers(80))] for _ in range(count)]
         rows = [
             {
-                **{"id": made + n + 1, "map_id": map_id, "category_id": keys[int(rng.integers(80))]},
+                **{"id": made + n + 1, "map_id": map_id, "category_id": classes[n]},
                 **{"probability": float(rng.uniform(0.5, 1)), "evidence": "{}", **zeros},
                 **dict(zip("xyz", map(float, places[n]), strict=True)),
                 **{"size_x": 0.3, "size_y": 0.3, "size_z": 0.3, "yaw": 0.0, "sightings": 4, "keyframes": 4},
@@ -60,7 +61,10 @@ def fill(store: Store, number: int, per_map: int = 1000) -> None:
             connection.execute(
                 insert(tables.landmark_relations),
                 [
-                    {"landmark_id": a, "kind": kind, "other_landmark_id": b, "score": float(rng.uniform(0.3, 1))}
+                    {
+                        **{"landmark_id": a, "kind": kind, "other_landmark_id": b},
+                        **{"score": float(rng.uniform(0.3, 1)), "other_category_id": classes[b - made - 1]},
+                    }
                     for a, kind, b in sorted(related)
                 ],
             )

@@ -49,6 +49,8 @@ def copy_landmarks(
             for name in ("first_keyframe_id", "last_keyframe_id"):
                 values[name] = None if row[name] is None else keyframes.get(int(row[name]))
             ids[int(row["id"])] = new_id(connection, tables.landmarks, values)
+        for row in hanging[tables.landmark_relations]:
+            row["other_category_id"] = categories.get(int(row["other_category_id"] or 0))
         for table, found in hanging.items():
             _insert(connection, table, found, ids, objects, recordings)
 

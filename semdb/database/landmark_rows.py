@@ -159,7 +159,10 @@ def replace_landmarks(connection: Connection, map_id: int, found: LandmarkSet, k
     _insert(connection, landmark_views, views)
     _insert(connection, landmark_visits, _visit_rows(connection, map_id, numbered))
     relations = [
-        {"landmark_id": ids[r.one], "kind": r.kind, "other_landmark_id": ids[r.other], "score": r.score}
+        {
+            **{"landmark_id": ids[r.one], "kind": r.kind, "other_landmark_id": ids[r.other], "score": r.score},
+            "other_category_id": known[found.landmarks[r.other].category],
+        }
         for r in found.relations
     ]
     _insert(connection, landmark_relations, relations)

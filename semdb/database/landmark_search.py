@@ -33,6 +33,7 @@ TENTATIVE = 0.5  # of the score of a confirmed landmark
 WALK_M = 5.0  # from the origin: a landmark so far away has half the score
 NOT_NEAR = 0.5  # a relation of this score is one
 MOST_SIGHTINGS = 20  # of a hit
+MOST_COUNTED = 200  # landmarks, of which it is counted where they stand
 CONFIRMED, GONE = "confirmed", "gone"
 
 
@@ -90,12 +91,10 @@ def _ids_of(names: str | Sequence[str]) -> Any:
 
 def _related(names: str, kinds: Sequence[str]) -> Select[Any]:
     """Relations of the landmark of the query around to any of the classes."""
-    r, o = landmark_relations.c, landmarks.alias("other")
+    r = landmark_relations.c  # of landmarks that are gone there are none
     return (
         select(r.score)
-        .select_from(landmark_relations.join(o, o.c.id == r.other_landmark_id))
-        .where(r.landmark_id == landmarks.c.id, r.kind.in_(kinds), o.c.category_id.in_(_ids_of(names)))
-        .where(o.c.state != GONE)
+        .where(r.landmark_id == landmarks.c.id, r.other_category_id.in_(_ids_of(names)), r.kind.in_(kinds))
         .correlate(landmarks)
     )
 
@@ -248,9 +247,15 @@ def earlier_ones(engine: Engine, wanted: Wanted, limit: int = 5) -> list[Any]:
 
 
 def _listed(engine: Engine, wanted: Wanted, *, gone: bool) -> list[Any]:
+    statement = _list_statement(_shape(wanted), gone).params(**_values(wanted))
+    return retry.read(engine, lambda connection: list(connection.execute(statement)))
+
+
+@lru_cache(maxsize=16)
+def _list_statement(wanted: _Shape, gone: bool) -> Select[Any]:
     m = landmarks.c
     last, last_of = keyframes.alias("last"), recordings.alias("last_of")
-    query = (
+    return (
         select(m.id, categories.c.name.label("category"), maps.c.name.label("map"), m.x, m.y, m.z, m.last_seen_ns)
         .add_columns(last_of.c.name.label("last_recording"), last.c.frame_index.label("last_frame_index"))
         .select_from(
@@ -259,12 +264,10 @@ def _listed(engine: Engine, wanted: Wanted, *, gone: bool) -> list[Any]:
             .outerjoin(last, last.c.id == m.last_keyframe_id)
             .outerjoin(last_of, last_of.c.id == last.c.recording_id)
         )
-        .where(*_conditions(_shape(wanted), gone=gone))
+        .where(*_conditions(wanted, gone=gone))
         .order_by(m.last_seen_ns.desc(), m.id)
         .limit(bindparam("most", type_=Integer))
-        .params(**_values(wanted))
     )
-    return retry.read(engine, lambda connection: list(connection.execute(query)))
 
 
 def anchors(engine: Engine, names: Sequence[str], map_id: int | None) -> int:
@@ -285,17 +288,21 @@ def objects_of(engine: Engine, names: Sequence[str], map_id: int | None) -> int:
 
 
 def usual_places(engine: Engine, names: Sequence[str], limit: int = 5) -> list[tuple[str, str, int]]:
-    """On, in or beside what landmarks of these classes stand in this database: kind, class, how many; most first."""
-    r, other = landmark_relations.c, landmarks.alias("other")
+    """On, in or beside what the newest `MOST_COUNTED` landmarks of these classes stand in this database: kind, class,
+    how many; most first.
+    """
+    r, m = landmark_relations.c, landmarks.c
     number = func.count().label("number")
+    newest = select(m.id).where(m.category_id.in_(_ids_of(names))).order_by(m.id.desc()).limit(MOST_COUNTED)
+    counted = newest.subquery("newest")  # servers want no limit inside of IN
     query = (
         select(r.kind, categories.c.name, number)
         .select_from(
-            landmark_relations.join(landmarks, landmarks.c.id == r.landmark_id)
-            .join(other, other.c.id == r.other_landmark_id)
-            .join(categories, categories.c.id == other.c.category_id)
+            counted.join(landmark_relations, r.landmark_id == counted.c.id).join(
+                categories, categories.c.id == r.other_category_id
+            )
         )
-        .where(landmarks.c.category_id.in_(_ids_of(names)), r.score >= NOT_NEAR)
+        .where(r.score >= NOT_NEAR)
         .where(or_(r.kind == "on", r.kind == "in", r.kind == "next_to"))
         .group_by(r.kind, categories.c.name)
         .order_by(number.desc(), r.kind.desc(), categories.c.name)

@@ -445,6 +445,7 @@ landmarks = _table(
     Column("last_seen_ns", BigInteger),
     Column("appearance", Blob),
     Index(None, "map_id", "category_id"),
+    Index(None, "category_id", "state", "map_id", "probability", "x", "y", "z"),
 )
 
 landmark_sightings = _table(
@@ -482,7 +483,9 @@ landmark_relations = _table(
     Column("kind", String(16), primary_key=True),
     _ref("other_landmark_id", "landmarks.id", primary_key=True),
     Column("score", Double, nullable=False),
+    Column("other_category_id", Id),
     Index(None, "other_landmark_id", "kind"),
+    Index(None, "landmark_id", "other_category_id", "kind", "score"),
 )
 
 landmark_merges = _table(

@@ -5,9 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
+from semdb.database.landmark_reading import load_landmarks
+from semdb.database.landmark_rows import LANDMARKS, load_gravity
+from semdb.database.left_out import telling
 from semdb.database.store import Store
 from semdb.errors import CodecError, FrameError
 from semdb.geometry import pose_error, transform_points
+from semdb.landmarks.boxes import turned_box
+from semdb.landmarks.values import LandmarkState
 from semdb.localization.query_image import QueryImage
 from semdb.pictures.drawing import category_colours, combine_pictures, draw_localization, localization_facts
 from semdb.pictures.top_view import MapObject, draw_top_view
@@ -75,10 +82,31 @@ def _keyframe(store: Store, found: Localization) -> tuple[ImageArray | None, tup
         return None, (), label
 
 
+def landmark_objects(store: Store, map_id: int) -> list[MapObject]:
+    """The confirmed landmarks of a map with their footprints, the largest first; none where they are out of date."""
+    if not any(item.kind == LANDMARKS and item.current for item in store.refinements(map_id)):
+        return []
+    gravity = load_gravity(store.engine, map_id)
+    up = np.array((0.0, 0.0, 1.0) if gravity is None else gravity.up)
+    shown = []
+    for thing in load_landmarks(store.engine, map_id, telling(store.say))[0]:
+        if thing.state == LandmarkState.CONFIRMED:
+            box = turned_box(np.array(thing.position), np.array(thing.size), thing.yaw, up)
+            shown.append(MapObject(thing.category, box.centre, thing.keyframes, box.corners[:4]))
+    return sorted(shown, key=lambda item: -_area(item))
+
+
+def _area(item: MapObject) -> float:
+    if item.footprint is None:
+        return 0.0
+    one, other = item.footprint[1] - item.footprint[0], item.footprint[2] - item.footprint[1]
+    return float(np.linalg.norm(np.cross(one, other)))
+
+
 def _top_view(store: Store, query: QueryImage, found: Localization, classes: Sequence[str]) -> ImageArray:
     info = store.find_map(found.map_name)
     ids, poses = store.poses(info.id, bad=store.left_out)
-    objects = [
+    objects = landmark_objects(store, info.id) or [
         MapObject(thing.category, transform_points(thing.world_from_camera, thing.centroid))
         for thing in store.iter_objects(info.id, bad=store.left_out)
         if thing.score >= 0.7

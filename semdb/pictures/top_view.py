@@ -32,11 +32,15 @@ TITLE_HEIGHT = 52
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapObject:
-    """An object seen from one or more keyframes: class name, position ``[3]`` in the map in metres, how often."""
+    """An object seen from one or more keyframes: class name, position ``[3]`` in the map in metres, how often.
+
+    A landmark has the corners ``[4, 3]`` of its `footprint`.
+    """
 
     category: str
     position: FloatArray
     count: int = 1
+    footprint: FloatArray | None = None
 
 
 def horizontal_axes(poses: FloatArray) -> FloatArray:
@@ -88,6 +92,9 @@ def merge_objects(objects: Sequence[MapObject], distance_m: float = MERGE_DISTAN
 
 
 def _worth_showing(objects: Sequence[MapObject]) -> list[MapObject]:
+    landmarks = [item for item in objects if item.footprint is not None]
+    if landmarks:
+        return landmarks
     merged = merge_objects(objects)
     often = [item for item in merged if item.count > 1]
     return (often if len(often) >= 8 else merged)[:MAX_OBJECTS]
@@ -138,14 +145,16 @@ def draw_top_view(
     are positions in `keyframe_poses`, the best first; `covariance` is ``[6, 6]`` (translation first, m) or
     ``[3, 3]``: its 95 % ellipse is drawn, enlarged by a factor that the legend names where it would be too small
     to see. Sightings of an object are merged (`merge_objects`); when many were seen more than once, the others are
-    left out. `colours` are class colours of another picture to keep. Raises ValueError without any keyframe.
+    left out. Where any of `objects` has a footprint, those are drawn, all of them, and no others. `colours`
+    are class colours of another picture to keep. Raises ValueError without any keyframe.
     """
     if len(keyframe_poses) == 0:
         raise ValueError("a top view needs at least one keyframe")
     shown = _worth_showing(objects)
     extra = [pose for pose in (estimated, true_pose) if pose is not None]
     cameras = np.concatenate([keyframe_poses, np.stack(extra)]) if extra else keyframe_poses
-    positions = np.vstack([cameras[:, :3, 3], *[item.position[None] for item in shown]])
+    places = [item.position[None] if item.footprint is None else item.footprint for item in shown]
+    positions = np.vstack([cameras[:, :3, 3], *places])
     axes_3d = _longest_across(horizontal_axes(keyframe_poses), positions)
     sheet = _Sheet(positions @ axes_3d.T, *size)
     figure, axes = blank_figure(*size)
@@ -178,7 +187,9 @@ def draw_top_view(
         occupied.append((wedge.min(axis=0), wedge.max(axis=0)))
     if shown:
         _object_names(axes, sheet, axes_3d, shown, occupied)
-        handles.append(_marker(INK, "objects (size: how often seen)", "o"))
+        landmarks = _marker(INK, "landmarks", "s")
+        dots = _marker(INK, "objects (size: how often seen)", "o")
+        handles.append(dots if shown[0].footprint is None else landmarks)
     _draw_scale_bar(axes, sheet, size)
     axes.text(24, 28, for_plot(title), color=INK, fontsize=15, weight="bold", va="center")
     axes.legend(
@@ -249,6 +260,12 @@ def _object_dots(
     boxes = []
     for item in objects:
         spot = sheet.place(axes_3d @ item.position)
+        if item.footprint is not None:
+            ring = sheet.place(item.footprint @ axes_3d.T)
+            colour = colours[item.category]
+            axes.add_patch(Polygon(ring, closed=True, fc=(*colour, 0.45), ec=INK, lw=0.9, zorder=3))
+            boxes.append((spot - 3, spot + 3))
+            continue
         radius = _dot_radius(item)
         axes.plot(*spot, "o", ms=2 * radius * 0.72, color=colours[item.category], mec=INK, mew=0.8, zorder=5)
         boxes.append((spot - radius, spot + radius))
@@ -276,7 +293,8 @@ def _object_names(
         extent = text.get_window_extent()
         half = np.array([extent.width, extent.height]) / 2 + 1
         gap = _dot_radius(item) + 3
-        sides = [(1, 0), (-1, 0), (0, -1), (0, 1), (0.8, -0.8), (0.8, 0.8), (-0.8, -0.8), (-0.8, 0.8)]
+        inside = [] if item.footprint is None else [(0.0, 0.0)]
+        sides = [*inside, (1, 0), (-1, 0), (0, -1), (0, 1), (0.8, -0.8), (0.8, 0.8), (-0.8, -0.8), (-0.8, 0.8)]
         for side in sides:
             middle = spot + np.array(side) * (half + gap)
             low, high = middle - half, middle + half

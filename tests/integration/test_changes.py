@@ -21,6 +21,7 @@ from semdb.database.store import Store, open_store
 from semdb.errors import NotFoundError, UsageError
 from semdb.landmarks.appearance import LENGTH
 from semdb.landmarks.identity import keep_ids
+from semdb.pictures.localization import landmark_objects
 from tests.database_samples import fill
 
 FIRST, SECOND = "first visit", "second visit"
@@ -120,6 +121,25 @@ def test_what_changed(store: Store) -> None:
         ("dining table", "present", 100, 0),
         ("chair", "unobserved", 100, 0),
     ]
+
+
+def test_the_map_from_above_agrees_with_sql(store: Store) -> None:
+    map_id, _ = stored(store)
+    with store.engine.connect() as connection:
+        query = "SELECT category, x, y, z, size_x, size_y, size_z, yaw FROM landmark_list WHERE state = 'confirmed'"
+        rows = {(row.category, row.x): row for row in connection.execute(text(query))}
+    shown = landmark_objects(store, map_id)
+    assert len(shown) == len(rows) == 5
+    for item in shown:
+        assert item.footprint is not None
+        row = rows[item.category, item.position[0]]
+        assert item.position.tolist() == [row.x, row.y, row.z]
+        along, across = item.footprint[1] - item.footprint[0], item.footprint[3] - item.footprint[0]
+        assert [np.linalg.norm(along), np.linalg.norm(across)] == pytest.approx([row.size_x, row.size_y])
+        assert np.arctan2(along[1], along[0]) == pytest.approx(row.yaw)
+        assert item.footprint.mean(axis=0) == pytest.approx([row.x, row.y, row.z - row.size_z / 2])
+    fill(store, name="third visit")  # landmarks are out of date now
+    assert landmark_objects(store, map_id) == []
 
 
 def test_what_cannot_be_compared(store: Store) -> None:

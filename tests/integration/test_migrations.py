@@ -195,6 +195,9 @@ def test_landmarks_of_before_get_visits(engine: Engine, empty_url: str) -> None:
     with engine.connect() as connection:
         assert connection.execute(text("SELECT COUNT(*) FROM landmark_visits")).scalar() == 0
         assert connection.execute(text("SELECT COUNT(*) FROM landmarks")).scalar() == 7
+        query = "SELECT COUNT(*) FROM landmark_relations r JOIN landmarks l ON l.id = r.other_landmark_id "
+        related = connection.execute(text(query + "WHERE r.other_category_id = l.category_id")).scalar()
+        assert related == connection.execute(text("SELECT COUNT(*) FROM landmark_relations")).scalar() == 5
     with open_store(empty_url) as store:
         assert len(stored_landmarks(store, map_id)) == 7
     with engine.connect() as connection:

@@ -213,6 +213,22 @@ def test_marks_of_the_map_are_where_they_should_be() -> None:
     assert (cup + tv) / 2 == pytest.approx([500, 52 + (600 - 52 - 64) / 2 + 110], abs=3)
 
 
+def test_landmarks_are_drawn_with_their_footprints_and_objects_are_not() -> None:
+    keyframes = np.stack([camera_at(x, y) for x in (0.0, 4.0) for y in (0.0, 1.0)])
+    ring = np.array([[1.0, 0.2, 0], [2.0, 0.2, 0], [2.0, 0.7, 0], [1.0, 0.7, 0]])
+    table = MapObject("table", ring.mean(axis=0), 3, ring)
+    colours = {"table": (0.0, 0.0, 1.0), "tv": (1.0, 0.0, 1.0)}
+    objects = [MapObject("tv", np.array([3.0, 0.5, 0]), 9), table]
+    picture = draw_top_view(keyframes, objects=objects, colours=colours, size=(1000, 600), title="")
+    blue = (np.abs(picture[60:-70].astype(int) - (140, 140, 255)) <= 8).all(axis=2)  # 0.45 of it over white
+    rows, columns = np.nonzero(blue)
+    # 1 m by 0.5 m at 220 pixels a metre, the lower left corner at x = 1 m
+    assert np.ptp(columns) == pytest.approx(220, abs=4)
+    assert np.ptp(rows) == pytest.approx(110, abs=4)
+    assert columns.min() == pytest.approx(60 + 220, abs=4)
+    assert not (np.abs(picture[60:-70].astype(int) - (255, 0, 255)) <= 8).all(axis=2).any()
+
+
 def test_estimate_is_in_the_colour_of_its_verdict_and_ellipse_is_enlarged() -> None:
     keyframes = np.stack([camera_at(x, 0.0) for x in range(5)])
     plain = draw_top_view(keyframes, size=(1000, 600))
