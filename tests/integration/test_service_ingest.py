@@ -46,7 +46,7 @@ def ended(served: Served, job: dict[str, Any], client: Any = None) -> dict[str, 
 
 
 def test_a_recording_by_its_path_and_its_job_as_events(served: Served, room: Path) -> None:
-    asked = served.client.post("/v1/maps/office/ingest", json={"path": "room", "keyframes": 2, "name": "first"})
+    asked = served.client.post("/v1/maps/office/ingest", json={"path": "room", "stride": 12, "name": "first"})
     assert asked.status_code == 202, asked.text
     job = asked.json()
     with served.client.stream("GET", f"{job['address']}/events") as stream:
@@ -56,7 +56,7 @@ def test_a_recording_by_its_path_and_its_job_as_events(served: Served, room: Pat
     last = json.loads(told[-1].removeprefix("data: "))
     assert (last["state"], last["items"], last["error"]) == ("done", {"done": 2}, None)
     assert served.database.map("office").keyframes == 2
-    again = served.client.post("/v1/maps/office/ingest", json={"path": str(room), "keyframes": 2, "name": "first"})
+    again = served.client.post("/v1/maps/office/ingest", json={"path": str(room), "stride": 12, "name": "first"})
     assert ended(served, again.json())["state"] == "done"
     assert served.database.map("office").keyframes == 2
 
@@ -108,7 +108,7 @@ def test_a_zip_is_unpacked_and_ingested(served: Served, room: Path) -> None:
     entries = {f"room/{path.relative_to(room)}": path.read_bytes() for path in room.rglob("*") if path.is_file()}
     sent = served.client.post("/v1/uploads", params={"name": "room.zip"}, content=zipped(entries))
     assert sent.status_code == 201, sent.text
-    body = {"upload": sent.json()["upload"], "keyframes": 1, "name": "sent"}
+    body = {"upload": sent.json()["upload"], "stride": 24, "name": "sent"}
     job = served.client.post("/v1/maps/office/ingest", json=body).json()
     found = ended(served, job)
     assert (found["state"], found["recordings"][0]["keyframes"]) == ("done", 1), found
@@ -171,7 +171,7 @@ def test_frames_of_a_live_session(served: Served, frames: list[Frame]) -> None:
     assert served.client.post(address, data=form, files=files).status_code == 409
     assert served.client.post(address, data=form | {"pose": "1,2,3"}, files=files).status_code == 422
     assert served.client.post(f"/v1/uploads/{'0' * 24}/frames", data=form, files=files).status_code == 404
-    job = served.client.post("/v1/maps/live/ingest", json={"upload": made["upload"], "keyframes": 2}).json()
+    job = served.client.post("/v1/maps/live/ingest", json={"upload": made["upload"], "stride": 2}).json()
     found = ended(served, job)
     assert found["state"] in ("done", "failed")
     assert found["error"] is None or "detector" in found["error"], found

@@ -24,7 +24,7 @@ from semdb.database.store import open_store
 from semdb.service.settings import ServeSettings
 from semdb.types import Frame
 from tests.database_samples import fill
-from tests.integration.opened import STRIDE, opener
+from tests.integration.opened import opener
 from tests.integration.test_tls import write_certificate
 from tests.rooms import COMMAND, environment
 from tests.rooms import semdb as run_semdb
@@ -60,6 +60,7 @@ def file_url(tmp_path: Path) -> str:
     return url
 
 
+@pytest.mark.long
 def test_two_processes_share_an_address(file_url: str, tmp_path: Path) -> None:
     log = tmp_path / "log"
     with (
@@ -95,6 +96,7 @@ def test_two_processes_share_an_address(file_url: str, tmp_path: Path) -> None:
     assert "Traceback" not in log.read_text()
 
 
+@pytest.mark.long
 def test_https(file_url: str, tmp_path: Path) -> None:
     certificate, key = sorted(
         write_certificate(tmp_path, "server", "127.0.0.1"), key=lambda path: path.suffix != ".pem"
@@ -118,6 +120,7 @@ def test_what_cannot_be_served_is_said(tmp_path: Path) -> None:
     assert (done.returncode, "pip install 'semdb[serve]'" in done.stderr) == (2, True), done.stderr
 
 
+@pytest.mark.long
 def test_a_service_that_is_killed_leaves_its_job_to_the_next(room: Path, tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path / 'a.sqlite3'}"
     with semdb.open(url) as made:
@@ -160,7 +163,7 @@ def test_servers_answer_as_the_library_and_plan_for_workers(
     plan = accounts.plan_accounts(server_url, roles=("reader",))
     schema.upgrade(make_engine(server_url))
     with opener(server_url, tmp_path / "cache") as opening:
-        opening().ingest(room, map="office", stride=2 * STRIDE)
+        opening().ingest(room, map="office", stride=12)
         accounts.execute(server_url, plan.statements)
         try:
             settings = ServeSettings(ingest_roots=str(room.parent))
@@ -181,7 +184,7 @@ def test_servers_answer_as_the_library_and_plan_for_workers(
                     assert listed.status_code == 200, listed.text
                 served.database.revoke_token(token.token.id)
                 assert served.client.get("/v1/maps").status_code == 200
-                body = {"path": "room", "name": "again", "keyframes": 2}
+                body = {"path": "room", "name": "again", "stride": 12}
                 job = served.client.post("/v1/maps/second/ingest", json=body).json()
                 for _ in range(600):
                     state = served.client.get(job["address"]).json()

@@ -17,7 +17,8 @@ from tests.serving import running
 CHECKS = "not_a_server_error,status_code_conformance,content_type_conformance,response_schema_conformance"
 
 
-@pytest.mark.parametrize("examples", [2, pytest.param(60, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("examples", [2, 60])
 def test_no_request_is_answered_by_an_error_of_the_service(tmp_path: Path, examples: int) -> None:
     url = f"sqlite:///{tmp_path / 'a.sqlite3'}"
     with open_store(url, create=True) as store:
