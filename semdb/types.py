@@ -88,6 +88,7 @@ class Sighting:
     category: str
     score: float
     height: float  # of the centre of its box, 0 at the top of the image, 1 at the bottom
+    box: tuple[float, float, float, float] | None = field(default=None, compare=False)  # as of a detection
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,7 +106,8 @@ class Detection:
 
     def sighting(self, height: int) -> Sighting:
         """What it says of its class in an image of `height` pixels."""
-        return Sighting(self.category, self.score, (float(self.box[1]) + float(self.box[3]) + 1) / (2 * height))
+        x1, y1, x2, y2 = (float(value) for value in self.box)
+        return Sighting(self.category, self.score, (y1 + y2 + 1) / (2 * height), (x1, y1, x2, y2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -195,6 +197,7 @@ class Description:
 class Verdict(StrEnum):
     LOCALIZED = "localized"
     AMBIGUOUS = "ambiguous"
+    COARSE = "coarse"  # a pose by landmarks alone, good to half a metre
     FAILED = "failed"
 
 

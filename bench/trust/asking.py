@@ -23,7 +23,9 @@ from semdb.refinement.steps import FOR_LOCALIZATION
 from semdb.settings import Settings
 
 # every pose is reported; the verdict is made afterwards, from the evidence, as a localizer makes it
-ALL_POSES = LocalizerOptions(verdict=replace(VerdictOptions(), ambiguous_inliers=0, ambiguous_first_inliers=0))
+ALL_POSES = LocalizerOptions(
+    verdict=replace(VerdictOptions(), ambiguous_inliers=0, ambiguous_first_inliers=0), landmarks=None
+)
 
 
 def ask_world(world: World, settings: Settings, every: int, first: int, say: Say) -> Iterator[Row]:

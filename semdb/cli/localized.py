@@ -18,7 +18,7 @@ from semdb.geometry.tum import TUM_COLUMNS, tum_line
 from semdb.shown import measure
 from semdb.types import Verdict
 
-COLOURS = {Verdict.LOCALIZED: "green", Verdict.AMBIGUOUS: "yellow", Verdict.FAILED: "red"}
+COLOURS = {Verdict.LOCALIZED: "green", Verdict.AMBIGUOUS: "yellow", Verdict.COARSE: "magenta", Verdict.FAILED: "red"}
 SIGMA_NOTE = "one standard deviation, by the covariance, where it is largest"
 
 

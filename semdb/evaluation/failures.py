@@ -66,6 +66,8 @@ def _end(query: QueryResult) -> str:
         return f"too little agreed ({query.inliers} inliers)"
     if query.verdict is Verdict.AMBIGUOUS:
         return "a pose was found but not trusted"
+    if query.verdict is Verdict.COARSE:
+        return "a pose by landmarks alone"
     if query.is_false:
         return f"a wrong pose was trusted ({query.inliers} inliers)"
     return "right, but among the largest errors"

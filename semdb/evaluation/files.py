@@ -44,6 +44,7 @@ def to_json(result: EvaluationResult) -> dict[str, Any]:
         "map_recordings": list(result.map_recordings),
         "query_recordings": list(result.query_recordings),
         "retrieval": None if result.retrieval is None else asdict(result.retrieval),
+        "coarse": dict(result.coarse),
         "truth": result.truth,
         "other_errors": None if result.other_errors is None else asdict(result.other_errors),
         "disagreement": None if result.disagreement is None else asdict(result.disagreement),

@@ -29,7 +29,8 @@ th, td { padding: .32rem .55rem; text-align: right; white-space: nowrap; border-
 th { color: var(--faint); font-weight: 600; position: sticky; top: 0; background: white; }
 th.text, td.text { text-align: left; } td.prose { white-space: normal; text-align: left; min-width: 20rem; }
 tr:hover td { background: var(--soft); } tr.ours td { background: #eaf4fb; font-weight: 600; }
-.localized { color: #1e8e4e; } .ambiguous { color: #b06a00; } .failed, .false { color: #c0322b; font-weight: 600; }
+.localized { color: #1e8e4e; } .ambiguous { color: #b06a00; } .coarse { color: #7b4fa3; }
+.failed, .false { color: #c0322b; font-weight: 600; }
 .problem { border-left: 4px solid #c0322b; background: #fdf1f0; padding: .7rem 1rem; margin: 1rem 0; }
 img { max-width: 100%; height: auto; display: block; margin: .6rem 0; }
 figure { margin: 1.2rem 0; } figcaption { color: var(--faint); font-size: .92rem; }

@@ -79,6 +79,7 @@ METHODS = {
                 twins=0,
                 refined_points=False,
                 surfaces=None,
+                landmarks=None,
             ),
         ),
         Method(
@@ -92,6 +93,7 @@ METHODS = {
                 twins=0,
                 refined_points=False,
                 surfaces=None,
+                landmarks=None,
             ),
             features="orb",
         ),

@@ -28,6 +28,7 @@ RECALL_LIMITS: Mapping[str, tuple[float, float]] = {
     "2.5deg": (math.inf, 2.5),
 }
 
+COARSE_TRANSLATION_M, COARSE_ROTATION_DEG = 0.5, 10.0
 TIMING_STAGES = ("decode", "detect", "encode", "features", "filter", "rank", "match", "pose", "total")
 
 
@@ -80,7 +81,9 @@ class QueryResult:
 
     @property
     def has_right_pose(self) -> bool:
-        """A pose within 0.25 m and 5 degrees, whatever the verdict."""
+        """A pose within 0.25 m and 5 degrees, whatever the verdict, but for `coarse`: that has no confidence."""
+        if self.verdict is Verdict.COARSE:
+            return False
         if self.translation_m is None or self.rotation_deg is None:
             return False
         return self.translation_m <= FALSE_TRANSLATION_M and self.rotation_deg <= FALSE_ROTATION_DEG
@@ -139,6 +142,7 @@ class EvaluationResult:
     map_recordings: tuple[str, ...] = ()
     query_recordings: tuple[str, ...] = ()
     retrieval: Retrieval | None = None
+    coarse: Mapping[str, float | None] = field(default_factory=dict)
     truth: str = "given"
     other_errors: Errors | None = None
     disagreement: Disagreement | None = None
@@ -226,6 +230,21 @@ def error_figures(queries: Sequence[QueryResult]) -> Errors:
     )
 
 
+def coarse_figures(queries: Sequence[QueryResult]) -> dict[str, float | None]:
+    """How many queries have a pose by landmarks alone, their share of all, and how many of them are near the truth.
+
+    They count in no other figure.
+    """
+    found = [query for query in queries if query.verdict == Verdict.COARSE]
+    known = [(q.translation_m, q.rotation_deg or 0.0) for q in found if q.translation_m is not None]
+    right = sum(m <= COARSE_TRANSLATION_M and degrees <= COARSE_ROTATION_DEG for m, degrees in known)
+    return {
+        "queries": len(found),
+        "share": len(found) / len(queries) if queries else None,
+        "within_0.5m_10deg": right / len(known) if known else None,
+    }
+
+
 def other_error_figures(queries: Sequence[QueryResult]) -> Errors | None:
     """`error_figures` against the other truth, over the queries that it knows; None where it knows none."""
     swapped = [
@@ -283,6 +302,7 @@ def summarise(
         )
         if known
         else None,
+        coarse=coarse_figures(results),
         other_errors=other_error_figures(results),
     )
 

@@ -179,7 +179,7 @@ def trajectory_plot(result: EvaluationResult) -> Figure | None:
         bar.set_ticks([0.001, 0.01, 0.05, 0.25, 0.5], labels=["0.001", "0.01", "0.05", "0.25", "0.5"])
     false = [query.is_false for query in posed]
     _mark(axes, ground, false, "o", "#c0322b", "false localization", hollow=True)
-    for verdict, shape in ((Verdict.AMBIGUOUS, "^"), (Verdict.FAILED, "X")):
+    for verdict, shape in ((Verdict.AMBIGUOUS, "^"), (Verdict.COARSE, "s"), (Verdict.FAILED, "X")):
         which = [query.verdict == verdict for query in posed]
         _mark(axes, ground, which, shape, VERDICT_COLOURS[verdict], str(verdict))
     axes.set_aspect("equal", adjustable="datalim")
@@ -196,7 +196,7 @@ def inlier_plot(result: EvaluationResult) -> Figure:
     figure = Figure(figsize=(9.0, 5.6), layout="constrained")
     axes = figure.subplots()
     style_axes(axes)
-    shapes = {Verdict.LOCALIZED: "o", Verdict.AMBIGUOUS: "^", Verdict.FAILED: "X"}
+    shapes = {Verdict.LOCALIZED: "o", Verdict.AMBIGUOUS: "^", Verdict.COARSE: "s", Verdict.FAILED: "X"}
     known = [error for error in (query.translation_m for query in result.per_query) if error]
     ceiling = 2.5 * max([*known, 2 * FALSE_TRANSLATION_M])
     for verdict, shape in shapes.items():

@@ -21,7 +21,7 @@ from semdb.localization.localizer import Localizer
 from semdb.localization.query_image import frame_at_scale
 from semdb.perception.describe import Describer, describer_from_specs
 from semdb.refinement.run import refine_map
-from semdb.refinement.steps import FOR_LOCALIZATION
+from semdb.refinement.steps import FOR_LOCALIZATION, LANDMARKS
 from semdb.settings import Settings
 from semdb.types import Camera, Description, Detection, FloatArray, Frame, Localization, ModelInfo
 
@@ -242,4 +242,4 @@ def _fill(map_name: str, task: Task, describer: Describer, store: Store, progres
         for entry in part.entries:
             if entry.index in summary.failed:
                 part.recording.note_decode_failure(entry, FrameError(summary.failed[entry.index]))
-    refine_map(store, store.find_map(map_name), kinds=FOR_LOCALIZATION, progress=progress)
+    refine_map(store, store.find_map(map_name), kinds=(*FOR_LOCALIZATION, LANDMARKS), progress=progress)

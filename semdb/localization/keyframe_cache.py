@@ -20,6 +20,8 @@ from semdb.geometry import POSE_UNIT_M, pose_distances
 from semdb.geometry.sensor import depth_noise
 from semdb.localization.coarse import MapChange
 from semdb.localization.edges import PlacedEdges
+from semdb.localization.landmark_pose import MapLandmarks
+from semdb.localization.map_landmarks import read_map_landmarks
 from semdb.localization.shape_cache import Local, ShapeCache, There, edge_cache, surface_cache
 from semdb.localization.surface_alignment import PlacedSurfaces
 from semdb.localization.views import ClassNumbers, KeyframeView, make_keyframe_view
@@ -48,6 +50,8 @@ class KeyframeCache:
         self._poses: tuple[list[int], FloatArray] | None = None
         self._stale: set[int] = set()  # keyframes whose poses are to be read again
         self._surfaces, self._edges = surface_cache(store), edge_cache(store)
+        self._landmarks: MapLandmarks | None = None
+        self._landmarks_read = False
         self._refined = refined
         self._points: str | None = None if refined else OFF
         self.left_out: dict[int, CodecError] = {}  # keyframes that cannot be used
@@ -71,6 +75,7 @@ class KeyframeCache:
             if self._points == USED:
                 self._views.clear()  # their points belong to the map as it was
             self._points = None
+        self._landmarks, self._landmarks_read = None, False
         for shapes in (self._surfaces, self._edges):
             shapes.forget(None if change.everything else change.added | change.gone)
         if change.everything:
@@ -203,6 +208,17 @@ class KeyframeCache:
                 if len(placed) == count:
                     break
             return placed
+
+    def landmarks(self) -> MapLandmarks | None:
+        """The confirmed landmarks of the map; None where it has none, or which way is up cannot be read."""
+        with self._turn:
+            if not self._landmarks_read:
+                try:
+                    self._landmarks = read_map_landmarks(self._store, self._map_id, self._read_poses()[1])
+                except CodecError:  # those who ask for landmarks are told; an image has its answer without
+                    self._landmarks = None
+                self._landmarks_read = True
+            return self._landmarks
 
     def distances(self, pose: FloatArray, keyframe_ids: Sequence[int]) -> FloatArray:
         """How far keyframes are from `pose` (`pose_distances`); zero for one that is not there any more."""

@@ -28,6 +28,8 @@ from semdb.localization.edge_step import EdgeVerdictOptions, weigh_edges
 from semdb.localization.edges import image_edges
 from semdb.localization.keyframe_cache import KeyframeCache
 from semdb.localization.laid_pose import LaidOptions, LaidPose, estimate_with, judge_with, may_overrule
+from semdb.localization.landmark_pose import LandmarkPose, LandmarkPoseOptions
+from semdb.localization.landmark_step import landmark_pose
 from semdb.localization.matching import Matches
 from semdb.localization.neighbours import by_side
 from semdb.localization.pose import (
@@ -63,6 +65,7 @@ class LocalizerOptions:
     refined_points: bool = True  # those of `semdb refine`, where the map has not changed since
     surfaces: SurfaceVerdictOptions | None = field(default_factory=SurfaceVerdictOptions)  # of a query with depth
     edges: EdgeVerdictOptions | None = field(default_factory=EdgeVerdictOptions)  # where neither convinces
+    landmarks: LandmarkPoseOptions | None = field(default_factory=LandmarkPoseOptions)  # where keypoints fail
     twin_cosine: float = 0.05  # how much less than the best keyframe's cosine is "as much"
 
     def with_threads(self, threads: int) -> LocalizerOptions:
@@ -77,6 +80,7 @@ class _Search:
     query: View
     keyframes_in_map: int
     laid: list[LaidPose] = field(default_factory=list)
+    by_landmarks: LandmarkPose | None = None
     keyframes: list[KeyframeView] = field(default_factory=list)
     matches: list[Matches] = field(default_factory=list)
     proposals: list[Proposal] = field(default_factory=list)
@@ -207,7 +211,25 @@ class Localizer:
                 if laid.is_sure:
                     break
         search.timing_ms["pose"] += _ms_since(started)
+        if judgement.verdict is Verdict.FAILED and search.stage != Stage.GIVEN:
+            judgement = self._by_landmarks(search, description, judgement)
         return self._result(search, judgement, evidence)
+
+    def _by_landmarks(self, search: _Search, description: Description, judgement: Judgement) -> Judgement:
+        """What landmarks make of an image whose keypoints failed; its confidence stays that of the keypoints."""
+        if self.options.landmarks is None:
+            return judgement
+        started = time.perf_counter()
+        found = landmark_pose(description, self.cache.landmarks(), self.options.landmarks)
+        search.by_landmarks = found
+        search.timing_ms["landmarks"] = _ms_since(started)
+        if found is None:
+            return judgement
+        doubt = found.doubt(self.options.landmarks)
+        if doubt:
+            return Judgement(Verdict.FAILED, judgement.confidence, f"{judgement.reason}; {doubt}")
+        reason = f"{judgement.reason}; {found.matched} landmarks agree, of {found.expected} in view"
+        return Judgement(Verdict.COARSE, judgement.confidence, reason)
 
     def _with_laid(
         self,
@@ -324,7 +346,9 @@ class Localizer:
             self._match(search, [proposal.keyframe_id for proposal in chosen])
 
     def _result(self, search: _Search, judgement: Judgement, evidence: Evidence | None) -> Localization:
-        estimate = search.estimate if judgement.verdict is not Verdict.FAILED else None
+        coarse = search.by_landmarks if judgement.verdict is Verdict.COARSE else None
+        estimate = search.estimate if judgement.verdict not in (Verdict.FAILED, Verdict.COARSE) else None
+        pose = coarse if coarse is not None else estimate
         inliers = dict.fromkeys((keyframe.keyframe_id for keyframe in search.keyframes), 0)
         if estimate is not None:
             ids = [keyframe.keyframe_id for keyframe in search.keyframes]
@@ -334,8 +358,8 @@ class Localizer:
         return Localization(
             verdict=judgement.verdict,
             map_name=self.map_name,
-            world_from_camera=None if estimate is None else estimate.world_from_camera,
-            covariance=None if estimate is None else estimate.covariance,
+            world_from_camera=None if pose is None else pose.world_from_camera,
+            covariance=None if pose is None else pose.covariance,
             confidence=judgement.confidence,
             inliers=0 if search.estimate is None else search.estimate.inliers,
             stage=search.stage,
@@ -366,11 +390,11 @@ class Localizer:
 
 
 def _numbers(search: _Search, evidence: Evidence | None) -> dict[str, float]:
-    """All evidence, of keypoints and of what was laid."""
+    """All evidence, of keypoints, of what was laid, and of landmarks."""
     found = evidence.as_mapping() if evidence else {}
     for laid in search.laid:
         found |= laid.numbers
-    return found
+    return found | (search.by_landmarks.as_mapping() if search.by_landmarks else {})
 
 
 def _evidence(search: _Search, estimate: PoseEstimate, rival: int) -> Evidence:

@@ -201,7 +201,7 @@ def ask(
                 say(f"map {entry.head.name!r} does not answer: {error}")
     if not answers:
         raise refused[0]
-    order = {Verdict.LOCALIZED: 2, Verdict.AMBIGUOUS: 1, Verdict.FAILED: 0}
+    order = {Verdict.LOCALIZED: 3, Verdict.AMBIGUOUS: 2, Verdict.COARSE: 1, Verdict.FAILED: 0}
     answers.sort(key=lambda answer: (order[answer[2].verdict], answer[2].inliers), reverse=True)
     query, description, best = answers[0]
     limit = maps[0].localizer.options.verdict.rival_share * best.inliers

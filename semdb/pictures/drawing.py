@@ -36,7 +36,12 @@ MASK_OPACITY = 0.28
 INK = "#1b2430"
 FAINT = "#6b7683"
 BACKGROUND_MATCH: Colour = (0.78, 0.80, 0.83)
-VERDICT_COLOURS = {Verdict.LOCALIZED: "#1e8e4e", Verdict.AMBIGUOUS: "#c77700", Verdict.FAILED: "#c0322b"}
+VERDICT_COLOURS = {
+    Verdict.LOCALIZED: "#1e8e4e",
+    Verdict.AMBIGUOUS: "#c77700",
+    Verdict.COARSE: "#7b4fa3",
+    Verdict.FAILED: "#c0322b",
+}
 # bright and far apart, readable over photographs; red and green verdict tones are left out of it
 PALETTE = (
     "#ffb000", "#2f9bff", "#ff5fa2", "#35d07f", "#a77bff", "#ff7a33", "#b5d92f", "#19c8e6", "#f4e04d", "#c98f5a",

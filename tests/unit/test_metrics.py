@@ -116,7 +116,7 @@ def test_json_has_exactly_the_contract_keys_and_no_nan() -> None:
         "false_localizations", "success_rate", "median_translation_m", "median_rotation_deg", "mean_translation_m",
         "mean_rotation_deg", "recall", "ranked_share", "keyframes_matched", "stages", "timing_ms", "per_query",
         "sequence", "keyframes_asked", "query_depth", "map_recordings", "query_recordings", "retrieval", "truth",
-        "other_errors", "disagreement",
+        "coarse", "other_errors", "disagreement",
     }  # fmt: skip
     assert set(document["per_query"][0]) == {
         "frame", "frame_index", "verdict", "translation_m", "rotation_deg", "candidate", "inliers", "confidence",
