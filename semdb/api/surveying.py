@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from semdb.api.base import Base
 from semdb.database.records import StoredImage
-from semdb.errors import UsageError
+from semdb.errors import NotFoundError, UsageError
+from semdb.names import storable
 
 if TYPE_CHECKING:
     from semdb.database.landmark_reading import StoredRelation
@@ -21,6 +23,16 @@ class Surveying(Base):
     def keyframe_files(self, keyframe_id: int) -> StoredImage:
         """The colour and depth files of a keyframe, bytes as recorded. Raises NotFoundError, CodecError."""
         return self._store().load_image(keyframe_id)
+
+    def has_recording(self, name: str, map: str | None = None) -> bool:
+        """Whether a map, or any, has a recording of that name, at the price of small queries. Raises NotFoundError."""
+        store = self._store()
+        heads = [self._head(map)] if map is not None else store.map_heads()
+        for head in heads:
+            with contextlib.suppress(NotFoundError):
+                store.find_recording(head.id, storable(name))
+                return True
+        return False
 
     def relations(self, map: str) -> list[StoredRelation]:
         """How the landmarks of a map stand to each other, by ids. Raises NotFoundError, CodecError."""

@@ -199,6 +199,5 @@ def check_pixels(data: bytes, what: str, most: int) -> None:
 
 def check_like(database: Database, access: Access, map: str | None, like: str) -> None:
     """Raises Problem 422 unless `like` is a recording of the database: the library takes folders too."""
-    known = {one.name for one in database.recordings(map if map is not None else access.map)}
-    if like not in known:
+    if not database.has_recording(like, map if map is not None else access.map):
         raise Problem(422, f"like: there is no recording {like!r} in the map")

@@ -48,7 +48,7 @@ async def get_map(request: Request, map: MapName) -> Response:
     return as_json(await read(request, look))
 
 
-@table.route("GET", "/v1/recordings", READ, schemas.Page[schemas.Recording])
+@table.route("GET", "/v1/recordings", READ, schemas.Page[schemas.Recording], errors=(404,))
 async def list_recordings(
     request: Request,
     map: Annotated[str | None, Query(max_length=255, description="only of this map")] = None,
@@ -156,7 +156,7 @@ def _relation_key(after: str) -> tuple[int, int, str]:
     return int(first), int(second), kind
 
 
-@table.route("GET", "/v1/find", READ, schemas.Found)
+@table.route("GET", "/v1/find", READ, schemas.Found, errors=(404,))
 async def find(
     request: Request,
     what: Annotated[str, Query(min_length=1, max_length=255, description="a class, or a word for one")],

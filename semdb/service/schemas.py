@@ -11,6 +11,56 @@ Matrix = list[list[float]]
 ItemT = TypeVar("ItemT")
 
 
+_POSE = {"position": [-0.19, 1.35, 1.42], "quat_wxyz": [0.394, -0.49, -0.596, 0.5]}
+_MATRIX = [[-0.21, 0.19, -0.96, -0.19], [0.98, 0.02, -0.21, 1.35], [-0.02, -0.98, -0.19, 1.42], [0.0, 0.0, 0.0, 1.0]]
+_CAMERA = {"width": 640, "height": 480, "fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5, "distortion": []}
+_KEYFRAME = {
+    "id": 1,
+    "map": "office",
+    "recording": "rgbd_dataset_freiburg1_desk",
+    "frame_index": 12,
+    "timestamp_ns": 1305031452791720000,
+    "camera": _CAMERA,
+    "pose": _POSE,
+    "world_from_camera": _MATRIX,
+}
+_OBJECT = {
+    "id": None,
+    "category": "chair",
+    "score": 0.93,
+    "box": [60.0, 40.0, 259.0, 199.0],
+    "position": [0.4, 1.9, 0.5],
+    "extent": [0.5, 0.9, 0.5],
+}
+_CANDIDATE = {"keyframe": 1, "recording": "rgbd_dataset_freiburg1_desk", "frame_index": 12}
+_ANSWER = {
+    "image": "image",
+    "frame_index": None,
+    "timestamp_ns": None,
+    "verdict": "localized",
+    "map": "office",
+    "pose": _POSE,
+    "world_from_camera": _MATRIX,
+    "covariance": [[1e-6 if row == column else 0.0 for column in range(6)] for row in range(6)],
+    "confidence": 0.99,
+    "inliers": 322,
+    "stage": "filtered",
+    "reason": "322 inliers",
+    "ranked_share": 0.2,
+    "keyframes_matched": 3,
+    "candidates": [{**_CANDIDATE, "class_score": 0.8, "cosine": 0.97, "inliers": 322}],
+    "refinements": {"points": "none"},
+    "objects": [_OBJECT],
+    "notes": ["camera of the images: that of the map's keyframes (--camera or --like name another)"],
+    "timing_ms": {"total": 56.0},
+}
+
+
+def example(content: dict[str, Any]) -> ConfigDict:
+    """The configuration of a model with an example."""
+    return ConfigDict(extra="allow", json_schema_extra={"examples": [content]})
+
+
 class Model(BaseModel):
     """An object whose members may become more."""
 
@@ -108,6 +158,8 @@ class Pose(Model):
 class Keyframe(Model):
     """A keyframe without what is large."""
 
+    model_config = example(_KEYFRAME)
+
     id: int
     map: str
     recording: str
@@ -171,6 +223,8 @@ class CandidateModel(Model):
 
 class Answer(Model):
     """Where an image was taken. A pose only for `localized` and `ambiguous`; `failed` is an answer, too."""
+
+    model_config = example(_ANSWER)
 
     image: str
     verdict: Literal["localized", "ambiguous", "coarse", "failed"]

@@ -79,6 +79,12 @@ def test_an_image_is_localized_as_by_the_library(served: Served, frames: list[Fr
         assert np.array_equal(values.mask_of(thing["mask"]), own.mask)
     anywhere = served.client.post("/v1/localize", data=form, files=files).json()
     assert (anywhere["map"], anywhere["pose"]) == ("office", found["pose"])
+    assert served.database.has_recording("room")
+    assert not served.database.has_recording("room", "a/b")
+    picture = {"image": files["image"]}
+    like = served.client.post("/v1/maps/a%2Fb/localize", data={"like": "stairs"}, files=picture).json()
+    wanted = served.database.localize(files["image"][1], map="a/b", like="stairs", name="image")
+    assert untimed(like) == untimed(as_sent(wanted))
 
 
 def test_depth_and_several_images(served: Served, frames: list[Frame]) -> None:
@@ -257,9 +263,7 @@ def test_a_session_by_http_and_over_a_connection(served: Served, frames: list[Fr
 
 def test_many_clients_at_once(served: Served, frames: list[Frame]) -> None:
     form, files = form_of(frames[6])
-    alone = time.perf_counter()
     wanted = untimed(served.client.post("/v1/maps/office/localize", data=form, files=files).json())
-    alone = time.perf_counter() - alone
 
     def ask(_: int) -> tuple[int, str, float]:
         started = time.perf_counter()
@@ -270,7 +274,7 @@ def test_many_clients_at_once(served: Served, frames: list[Frame]) -> None:
         found = list(pool.map(ask, range(20)))
     assert {status for status, _, _ in found} == {200}
     assert {answer for _, answer, _ in found} == {wanted}
-    assert max(seconds for _, _, seconds in found) < 25 * max(alone, 0.1)
+    assert max(seconds for _, _, seconds in found) < 25  # test_service_load compares with one alone
     assert served.service.localizing.inside == 0
 
 

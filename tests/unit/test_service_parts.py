@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from semdb.errors import DatabaseError, FrameError, ModelError, NotFoundError, UsageError
+from semdb.service import schemas
 from semdb.service.middleware import check_depth
 from semdb.service.pool import Pool
 from semdb.service.problems import Problem, problem_of, scrubbed
@@ -111,6 +112,12 @@ def test_errors_of_the_library_as_problems() -> None:
     ):
         problem = problem_of(error)
         assert (problem.status, "/" in problem.detail) == (status, False)
+
+
+def test_examples_of_the_document_are_valid() -> None:
+    for model in (schemas.Answer, schemas.Keyframe):
+        [example] = model.model_json_schema()["examples"]
+        model.model_validate(example)
 
 
 def test_json_of_too_many_levels() -> None:
