@@ -174,7 +174,7 @@ class Localizing(Base):
         opened = self.open_recording(recording, map=map, camera=camera, reading=reading, like=like)
         if every < 1:
             raise UsageError(f"every={every}: one frame in how many? From 1 on")
-        items = (partial(_read_frame, opened, entry, query_depth) for entry in opened.entries[::every])
+        items = (partial(read_frame, opened, entry, query_depth) for entry in opened.entries[::every])
         return self._answers(items, map, None, None, coarse, log=log, unreadable=unreadable)
 
     def open_recording(
@@ -285,7 +285,7 @@ class Localizing(Base):
             self._say(f"the answer for {image} is not in the log of queries: {error}")
 
 
-def _read_frame(recording: Recording, entry: FrameEntry, with_depth: bool, reader: QueryReader) -> QueryImage:
+def read_frame(recording: Recording, entry: FrameEntry, with_depth: bool, reader: QueryReader) -> QueryImage:
     """One frame of a recording as a query. Raises FrameError that names the file."""
     from semdb.types import Frame
 

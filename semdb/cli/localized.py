@@ -16,7 +16,7 @@ from semdb.door.values import Answer
 from semdb.errors import UsageError
 from semdb.geometry.tum import TUM_COLUMNS, tum_line
 from semdb.shown import measure
-from semdb.types import Verdict
+from semdb.types import FloatArray, Verdict
 
 COLOURS = {Verdict.LOCALIZED: "green", Verdict.AMBIGUOUS: "yellow", Verdict.COARSE: "magenta", Verdict.FAILED: "red"}
 SIGMA_NOTE = "one standard deviation, by the covariance, where it is largest"
@@ -128,9 +128,16 @@ class Trajectory:
         if answer.localized and answer.world_from_camera is not None:
             index = number if answer.frame_index is None else answer.frame_index
             time_ns = answer.timestamp_ns if self._timed and answer.timestamp_ns is not None else index * 10**9
-            self._stream.write(tum_line(time_ns, answer.world_from_camera) + "\n")
-            self._stream.flush()
-            self.poses += 1
+            self.write(time_ns, answer.world_from_camera)
+
+    def write(self, time_ns: int, world_from_camera: FloatArray) -> None:
+        """Writes a pose ``[4, 4]``."""
+        if self._timed is None:
+            self._timed = True
+            self._stream.write(f"# poses of tracked frames, world from camera, metres\n{TUM_COLUMNS}\n")
+        self._stream.write(tum_line(time_ns, world_from_camera) + "\n")
+        self._stream.flush()
+        self.poses += 1
 
 
 @contextmanager

@@ -38,6 +38,7 @@ COMMANDS: dict[str, str] = {
     "changes": "semdb.cli.changes",
     "loops": "semdb.cli.loops",
     "localize": "semdb.cli.localize",
+    "track": "semdb.cli.track",
     "evaluate": "semdb.cli.evaluate",
     "show": "semdb.cli.show",
     "export": "semdb.cli.export",

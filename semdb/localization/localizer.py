@@ -153,12 +153,16 @@ class Localizer:
         self._try(search, Batch(Stage.GIVEN, proposals, 0))
         return self._conclude(search, description)
 
-    def _check(self, description: Description) -> int:
-        """How many keyframes the map holds, once it is known that they can be compared with `description`."""
+    def refresh(self) -> int:
+        """How many keyframes the map holds, once what was done to it is taken over."""
         change = self.source.refresh()
         if change:
             self.cache.forget(change)
-        keyframes = self.source.keyframe_count()
+        return self.source.keyframe_count()
+
+    def _check(self, description: Description) -> int:
+        """How many keyframes the map holds, once it is known that they can be compared with `description`."""
+        keyframes = self.refresh()
         if not keyframes:
             raise NotFoundError(f"map {self.map_name!r} holds no keyframe: ingest a recording into it first")
         check_models(self.models, description.models, f"the map {self.map_name!r}")

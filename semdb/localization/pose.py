@@ -238,6 +238,7 @@ def _refine(
     and where the query shows each of them.
     Raises numpy.linalg.LinAlgError where the pose is not determined.
     """
+    agreeing = _thinned(agreeing, options.most_pairs and options.most_pairs // 2)  # it is a rough solution
     used = pairs.take(agreeing)
     if not options.guided:
         unaligned = Alignment(query.xy[used.query], np.zeros(len(used), np.bool_))
@@ -252,6 +253,7 @@ def _refine(
     agreeing = projected_error_px(query, pairs, projected) < options.inlier_px
     if agreeing.sum() < MINIMUM_PAIRS:
         raise np.linalg.LinAlgError("too few pairs are left")
+    agreeing = _thinned(agreeing, options.most_pairs)
     used, points = pairs.take(agreeing), world_points_of(pairs, keyframes)[agreeing]
     alignment = align_pairs(query, keyframes, used.query, used.slot, used.keypoint, adjusted, options.threads)
     pose = adjusted.camera_from_world
@@ -259,6 +261,18 @@ def _refine(
     seen = Alignment(query.xy[pairs.query], np.zeros(len(pairs), np.bool_))
     seen.xy[agreeing], seen.found[agreeing] = alignment.xy, alignment.found
     return pairs, projected_error_px(query, pairs, project_adjusted(query, keyframes, adjusted)), adjusted, seen
+
+
+def _thinned(agreeing: BoolArray, most: int | None) -> BoolArray:
+    """At most so many of the pairs that agree, evenly over all of them; the same array where they are not more."""
+    if most is None:
+        return agreeing
+    rows = np.flatnonzero(agreeing)
+    if len(rows) <= most:
+        return agreeing
+    kept = np.zeros(len(agreeing), np.bool_)
+    kept[rows[np.linspace(0, len(rows) - 1, most).astype(int)]] = True
+    return kept
 
 
 def _project(query: View, keyframes: Sequence[KeyframeView], camera_from_world: FloatArray) -> list[FloatArray]:

@@ -24,3 +24,4 @@ class PoseOptions:
     use_query_depth: bool = True
     motion: MotionPrior = field(default_factory=MotionPrior)
     threads: int = field(default_factory=cores)  # keyframes are worked on side by side
+    most_pairs: int | None = None  # that are adjusted, evenly taken of all; None: every one

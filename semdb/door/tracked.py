@@ -1,0 +1,106 @@
+"""What tracking answers with for each frame."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from semdb.geometry import quat_wxyz_from_rotation
+from semdb.shown import for_terminal
+from semdb.tracking.states import TrackSource, TrackState
+from semdb.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracked:
+    """Where a moving camera is. `world_from_camera` ``[4, 4]`` and `covariance` ``[6, 6]`` are None when ``lost``.
+
+    The pose is metres in the map's world, the covariance of translation (m), then rotation (rad, left perturbation in
+    the world). Only in the state ``tracking`` is the pose measured in the map in this image. `inliers` are its
+    keypoints that agree with keyframes. `map_from_odom` ``[4, 4]`` corrects the robot's odometry, where that is given:
+    it is the last one measured. `latency_ms` is from the decoded image to the answer.
+    """
+
+    image: str
+    time_s: float
+    state: TrackState
+    source: TrackSource
+    map: str
+    world_from_camera: FloatArray | None
+    covariance: FloatArray | None
+    inliers: int
+    reason: str
+    latency_ms: float
+    confidence: float | None = None  # of a relocalization
+    map_from_odom: FloatArray | None = None
+    frame_index: int | None = None
+    timestamp_ns: int | None = None
+    smoothed: bool = False  # frames after it took part
+
+    @property
+    def tracking(self) -> bool:
+        """Whether the pose is measured in the map, and to be relied on."""
+        return self.state is TrackState.TRACKING
+
+    @property
+    def position(self) -> FloatArray | None:
+        """x, y, z ``[3]`` of the camera in the map, metres."""
+        return None if self.world_from_camera is None else self.world_from_camera[:3, 3]
+
+    @property
+    def quat_wxyz(self) -> FloatArray | None:
+        """The rotation ``world_from_camera`` as a quaternion ``[4]``."""
+        return None if self.world_from_camera is None else quat_wxyz_from_rotation(self.world_from_camera[:3, :3])
+
+    @property
+    def sigma_m(self) -> float:
+        """The standard deviation of the position along its least certain direction, metres; NaN without a pose."""
+        return _largest_sigma(self.covariance, 0)
+
+    @property
+    def sigma_deg(self) -> float:
+        """The standard deviation of the rotation about its least certain axis, degrees; NaN without a pose."""
+        return math.degrees(_largest_sigma(self.covariance, 3))
+
+    def as_dict(self) -> dict[str, Any]:
+        """What ``semdb track --json-lines`` prints for a frame."""
+        return {
+            "image": self.image,
+            "frame_index": self.frame_index,
+            "timestamp_ns": self.timestamp_ns,
+            "time_s": self.time_s,
+            "state": str(self.state),
+            "source": str(self.source),
+            "map": self.map,
+            "pose": _pose_dict(self.world_from_camera),
+            "covariance": None if self.covariance is None else self.covariance.tolist(),
+            "inliers": self.inliers,
+            "confidence": self.confidence,
+            "reason": self.reason,
+            "map_from_odom": _pose_dict(self.map_from_odom),
+            "smoothed": self.smoothed,
+            "latency_ms": self.latency_ms,
+        }
+
+    def __repr__(self) -> str:
+        where = f"{self.state} ({self.source}) in map {self.map}"
+        if self.position is not None:
+            x, y, z = self.position
+            where += f" at {x:.3f} {y:.3f} {z:.3f} m, sigma {1000 * self.sigma_m:.1f} mm {self.sigma_deg:.2f} deg"
+        return for_terminal(f"<{self.image}: {where}; {self.latency_ms:.0f} ms>")
+
+
+def _pose_dict(pose: FloatArray | None) -> dict[str, list[float]] | None:
+    if pose is None:
+        return None
+    return {"position": pose[:3, 3].tolist(), "quat_wxyz": quat_wxyz_from_rotation(pose[:3, :3]).tolist()}
+
+
+def _largest_sigma(covariance: FloatArray | None, start: int) -> float:
+    if covariance is None:
+        return math.nan
+    half = covariance[start : start + 3, start : start + 3]
+    return math.sqrt(max(0.0, float(np.linalg.eigvalsh(half)[-1])))

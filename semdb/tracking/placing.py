@@ -1,0 +1,251 @@
+"""A frame placed near to where it should be: by keyframes of the map, and by the frame before it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import poselib
+
+from semdb.geometry import invert_pose, transform_points
+from semdb.localization.adjustment import in_front
+from semdb.localization.confidence import gather_evidence, sigmas
+from semdb.localization.matching import Matches
+from semdb.localization.pairs import Pairs, guided_pairs, reprojection_px, world_points_of
+from semdb.localization.pose import (
+    FirstPose,
+    FirstSupport,
+    PoseEstimate,
+    estimate_pose,
+    first_pose,
+    image_spread,
+    match_views,
+    rival_pose,
+    robust_pnp,
+)
+from semdb.localization.verdict import judge
+from semdb.localization.views import KeyframeView, View
+from semdb.tracking.options import PlacingOptions
+from semdb.tracking.pose_filter import Step
+from semdb.types import FloatArray, Verdict
+
+LEAST_STEP_PAIRS = 25
+STEP_PX = 3.0  # of pairs of two images that agree on a step
+CAUCHY_PX = 1.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """A pose in the map with its support."""
+
+    estimate: PoseEstimate
+    keyframes: tuple[KeyframeView, ...]
+
+    @property
+    def pose(self) -> FloatArray:
+        return self.estimate.world_from_camera
+
+    @property
+    def covariance(self) -> FloatArray:
+        """``[6, 6]``"""
+        found = self.estimate.covariance
+        return np.diag([0.05**2] * 3 + [0.03**2] * 3) if found is None else found
+
+
+def search_radius_px(view: View, covariance: FloatArray, distance_m: float, options: PlacingOptions) -> float:
+    """Pixels within which a point at a distance is to be looked for, with a pose of `covariance` ``[6, 6]``."""
+    metres, degrees = sigmas(covariance)
+    off = np.hypot(metres / max(distance_m, 0.3), np.radians(degrees))
+    return float(np.clip(3 * view.focal * off, options.least_px, options.most_px))
+
+
+def place_near(
+    view: View, keyframes: Sequence[KeyframeView], predicted: FloatArray, radius_px: float, options: PlacingOptions
+) -> Placed | None:
+    """The pose of a frame near `predicted` ``[4, 4]``, as far as it holds (`PlacingOptions`); None without one."""
+    if not keyframes:
+        return None
+    near = replace(options.pose.matching, guided_radius_px=radius_px)
+    pairs = guided_pairs(view, keyframes, project_all(view, keyframes, predicted), near)
+    if len(pairs) < options.least_inliers:
+        return None
+    points = world_points_of(pairs, keyframes)
+    sample = np.linspace(0, len(pairs) - 1, min(options.sampled, len(pairs))).astype(np.int32)
+    found = _first_pose(view, pairs.take(sample), points[sample], predicted, options)
+    if found is None:
+        return None
+    pose, share = found
+    close = reprojection_px(view, pose, pairs.query, points) < options.pose.max_reprojection_px
+    rows = pairs.query[close]
+    inliers = len(np.unique(rows))
+    if inliers < options.least_inliers:
+        return None
+    counts = np.bincount(pairs.slot[close], minlength=len(keyframes))
+    best = int(counts.argmax())
+    support = FirstSupport(inliers, int(counts[best]), share, best)
+    start = FirstPose(pose, len(keyframes), support, inliers, image_spread(view, rows), (pairs, points))
+    none = [_no_matches() for _ in keyframes]
+    estimate = estimate_pose(view, keyframes, none, options.pose, start)
+    if estimate is None:
+        return None
+    placed = Placed(estimate, tuple(keyframes))
+    if not _is_sound(estimate, options):
+        return None
+    if estimate.inliers >= options.strong_inliers and share >= options.strong_share:
+        return placed
+    return placed if convinces(view, placed, options) else None
+
+
+def _first_pose(
+    view: View, pairs: Pairs, points: FloatArray, predicted: FloatArray, options: PlacingOptions
+) -> tuple[FloatArray, float] | None:
+    """A rough ``camera_from_world`` and the share of pairs that agree: from the prediction, else by random samples."""
+    fitted = _fitted(view, invert_pose(predicted), pairs, points, options.pose.max_reprojection_px)
+    if fitted is not None:
+        share = float((reprojection_px(view, fitted, pairs.query, points) < options.pose.max_reprojection_px).mean())
+        if share >= options.strong_share:
+            return fitted, share
+    found = robust_pnp(view, pairs, points, options.pose, options.iterations)
+    if found is None or found[1].mean() < options.least_first_share:
+        return None
+    return found[0], float(found[1].mean())
+
+
+def _fitted(view: View, start: FloatArray, pairs: Pairs, points: FloatArray, scale_px: float) -> FloatArray | None:
+    """``camera_from_world`` from a start, with a loss that leaves out what is far off; None where it diverges."""
+    first = poselib.CameraPose()
+    first.R, first.t = start[:3, :3], start[:3, 3]
+    camera = {"model": "SIMPLE_PINHOLE", "width": view.camera.width, "height": view.camera.height}
+    pixels = view.xy[pairs.query] * view.focal
+    fitted, _ = poselib.refine_absolute_pose(
+        pixels, points, first, {**camera, "params": [view.focal, 0, 0]},
+        {"loss_type": "CAUCHY", "loss_scale": scale_px},
+    )  # fmt: skip
+    pose = np.eye(4)
+    pose[:3] = fitted.Rt
+    return pose if np.isfinite(pose).all() else None
+
+
+def place_anywhere_near(view: View, keyframes: Sequence[KeyframeView], options: PlacingOptions) -> Placed | None:
+    """The pose of a frame that may be anywhere, by whole images of `keyframes`, if all evidence speaks for it."""
+    if not keyframes:
+        return None
+    matches = match_views(view, keyframes, options.pose)
+    start = first_pose(view, keyframes, matches, options.pose)
+    if start is None or start.first.inliers < options.verdict.few_first_inliers:
+        return None
+    estimate = estimate_pose(view, keyframes, matches, options.pose, start)
+    if estimate is None or not _is_sound(estimate, options):
+        return None
+    placed = Placed(estimate, tuple(keyframes))
+    return placed if convinces(view, placed, options, matches) else None
+
+
+def _is_sound(estimate: PoseEstimate, options: PlacingOptions) -> bool:
+    metres, degrees = sigmas(estimate.covariance)
+    return (
+        estimate.inliers >= options.least_inliers
+        and estimate.spread >= options.least_spread
+        and metres <= options.most_sigma_m
+        and degrees <= options.most_sigma_deg
+    )
+
+
+def convinces(view: View, placed: Placed, options: PlacingOptions, matches: Sequence[Matches] | None = None) -> bool:
+    """Whether the verdict on the image alone would be that it is localized."""
+    rival = 0
+    if matches is not None:
+        rival = rival_pose(view, placed.keyframes, matches, placed.estimate, options.pose)
+    unknown = [float("nan")] * len(placed.keyframes)
+    evidence = gather_evidence(view, placed.keyframes, placed.estimate, rival, unknown)
+    return judge(evidence, options.verdict).verdict is Verdict.LOCALIZED
+
+
+def project_all(view: View, keyframes: Sequence[KeyframeView], pose: FloatArray) -> list[FloatArray]:
+    """Where a camera at `pose` sees each keyframe's points ``[n, 2]``, pixels from the centre; NaN outside of it."""
+    camera_from_world = invert_pose(pose)
+    half = np.array([view.camera.width, view.camera.height]) * 0.75
+    found = []
+    for keyframe in keyframes:
+        at = in_front(transform_points(camera_from_world, keyframe.world_points)) * view.focal
+        at[~(np.abs(at) < half).all(axis=1)] = np.nan
+        found.append(at)
+    return found
+
+
+def step_between(before: KeyframeView, view: View, expected: FloatArray, options: PlacingOptions) -> Step | None:
+    """The motion from the image `before`, whose world is its own camera, to `view`; `expected` ``[4, 4]`` is a guess.
+
+    Pairs are looked for where the guess puts them, then everywhere. None where too few agree.
+    """
+    pairs = guided_pairs(
+        view, [before], project_all(view, [before], expected), replace(options.pose.matching, guided_radius_px=40.0)
+    )
+    found = _step(before, view, pairs, options, expected)
+    if found is not None:
+        return found
+    return _step(before, view, _all_pairs(before, view, options), options)
+
+
+def _all_pairs(before: KeyframeView, view: View, options: PlacingOptions) -> Pairs:
+    [matches] = match_views(view, [before], options.pose)
+    return Pairs(matches.query, np.zeros(len(matches), np.int32), matches.keyframe, matches.same_class)
+
+
+def _step(
+    before: KeyframeView, view: View, pairs: Pairs, options: PlacingOptions, expected: FloatArray | None = None
+) -> Step | None:
+    if len(pairs) < LEAST_STEP_PAIRS:
+        return None
+    points = world_points_of(pairs, [before])
+    sample = np.linspace(0, len(pairs) - 1, min(options.sampled, len(pairs))).astype(np.int32)
+    pairs, points = pairs.take(sample), points[sample]
+    if expected is None:
+        found = robust_pnp(view, pairs, points, options.pose, options.iterations)
+        start = None if found is None else found[0]
+    else:
+        start = _fitted(view, invert_pose(expected), pairs, points, options.pose.max_reprojection_px)
+    if start is None:
+        return None
+    near = reprojection_px(view, start, pairs.query, points) < STEP_PX
+    if near.sum() < LEAST_STEP_PAIRS or near.mean() < options.strong_share:
+        return None
+    pairs, points = pairs.take(near), points[near]
+    after_from_before = _fitted(view, start, pairs, points, CAUCHY_PX)
+    if after_from_before is None:
+        return None
+    covariance = _covariance_of(view, after_from_before, view.xy[pairs.query] * view.focal, points)
+    return None if covariance is None else Step(invert_pose(after_from_before), covariance)
+
+
+def _covariance_of(view: View, pose: FloatArray, pixels: FloatArray, points: FloatArray) -> FloatArray | None:
+    """``[6, 6]`` of a step in the frame before it (m, left rad), from how far pixels ``[n, 2]`` are off."""
+    local = transform_points(pose, points)
+    x, y, z = local.T
+    error = (local[:, :2] / z[:, None]) * view.focal - pixels
+    variance = float(np.median((error**2).sum(axis=1)) / (2 * np.log(2)))  # Rayleigh
+    weight = 1 / (1 + (error**2).sum(axis=1) / CAUCHY_PX**2)
+    jacobian = np.zeros((len(points), 2, 6))  # of a translation and a left rotation of the camera's frame
+    jacobian[:, 0, 0] = jacobian[:, 1, 1] = view.focal / z
+    jacobian[:, 0, 2], jacobian[:, 1, 2] = -view.focal * x / z**2, -view.focal * y / z**2
+    turned = np.zeros((len(points), 3, 3))  # d(exp(w) p) / dw
+    turned[:, 0, 1], turned[:, 0, 2], turned[:, 1, 2] = z, -y, x
+    turned -= turned.transpose(0, 2, 1)
+    jacobian[:, :, 3:] = jacobian[:, :, :3] @ turned
+    information = np.einsum("n,nij,nik->jk", weight, jacobian, jacobian) / max(variance, 0.05)
+    try:
+        inverse = np.linalg.inv(information)
+    except np.linalg.LinAlgError:
+        return None
+    # error of after_from_before (left, in the camera after) to that of its inverse: p = -R' t, turned by -R'
+    rotation = pose[:3, :3]
+    adjoint = np.zeros((6, 6))
+    adjoint[:3, :3] = adjoint[3:, 3:] = rotation.T
+    covariance: FloatArray = adjoint @ inverse @ adjoint.T
+    return covariance if np.isfinite(covariance).all() else None
+
+
+def _no_matches() -> Matches:
+    empty = np.zeros(0, np.int32)
+    return Matches(empty, empty, np.zeros(0, np.float32), np.zeros(0, np.bool_))
