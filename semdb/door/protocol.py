@@ -10,6 +10,7 @@ if TYPE_CHECKING:
 
     from semdb.database.records import Deleted, MapInfo, RecordingStatus
     from semdb.door.found import Found
+    from semdb.door.tracked import Tracked
     from semdb.door.values import Answer, Keyframe, Rows
     from semdb.ingestion.run import IngestSummary
     from semdb.localization.query_image import Depth, Image, PathText
@@ -18,9 +19,26 @@ if TYPE_CHECKING:
     from semdb.recordings.options import ReadOptions
     from semdb.refinement.run import StepResult
     from semdb.trajectory.recording import RecordedTrajectory
-    from semdb.types import Frame, ModelInfo
+    from semdb.types import FloatArray, Frame, ModelInfo
 
     Source: TypeAlias = PathText | Sequence[PathText] | Recording | Iterable[Frame]
+
+
+class CameraTracker(Protocol):
+    """One camera in one map; see `semdb.api.tracking.MapTracker`."""
+
+    @property
+    def map(self) -> str: ...
+
+    def update(
+        self,
+        image: Image,
+        *,
+        time_s: float | None = None,
+        depth: Depth | None = None,
+        odometry: FloatArray | None = None,
+        name: str | None = None,
+    ) -> Tracked: ...
 
 
 class SemanticDatabase(Protocol):
@@ -100,6 +118,15 @@ class SemanticDatabase(Protocol):
         like: PathText | None = None,
         name: Sequence[str] | None = None,
     ) -> list[Answer]: ...
+
+    def tracker(
+        self,
+        map: str | None = None,
+        *,
+        camera: CameraLike | None = None,
+        like: PathText | None = None,
+        depth_scale: float | None = None,
+    ) -> CameraTracker: ...
 
     def ingest(
         self,

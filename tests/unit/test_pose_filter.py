@@ -1,4 +1,4 @@
-"""The filter of tracking: what it says of its own errors is true, and smoothing is the answer of all frames together."""
+"""The filter of tracking: what it says of its errors is true, and smoothing is the answer of all frames together."""
 
 from __future__ import annotations
 
@@ -98,7 +98,9 @@ def test_smoothing_is_better_than_the_filter_and_says_so() -> None:
         passages = run(seen, steps, OPTIONS)
         for number in range(5, 15):
             after, (pose, covariance) = passages[number].after, smoothed(passages[number:])
-            assert after is not None and pose is not None and covariance is not None
+            assert after is not None
+            assert pose is not None
+            assert covariance is not None
             forward.append(pose_error(after.pose, poses[number])[0])
             both.append(pose_error(pose, poses[number])[0])
             error = difference(poses[number], pose)
@@ -109,11 +111,12 @@ def test_smoothing_is_better_than_the_filter_and_says_so() -> None:
 
 
 def test_smoothing_stops_where_the_camera_was_lost() -> None:
-    poses, seen, steps = walk(np.random.default_rng(2), 4, 0.3)
+    _poses, seen, steps = walk(np.random.default_rng(2), 4, 0.3)
     passages = run(seen, steps, OPTIONS)
     alone, _ = smoothed([passages[1], Passage(None, None, passages[2].after)])
     after = passages[1].after
-    assert after is not None and alone is not None
+    assert after is not None
+    assert alone is not None
     np.testing.assert_array_equal(alone, after.pose)
     assert smoothed([Passage(None, None, None), passages[1]]) == (None, None)
 
