@@ -51,8 +51,8 @@ class MotionOptions:
     away over `forgotten` of `pose_distances`, not with time.
     """
 
-    acceleration: float = 3.0
-    turn_acceleration: float = 6.0
+    acceleration: float = 1.5
+    turn_acceleration: float = 4.0
     astray_m_s: float = 0.12  # how far off it gets in the longer run, a second
     astray_rad_s: float = 0.15
     slows_s: float = 0.7  # what is not seen is thought to come to rest in so long
