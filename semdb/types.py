@@ -202,6 +202,22 @@ class Verdict(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
+class Tolerance:
+    """How far poses may differ that are one for the caller."""
+
+    metres: float
+    degrees: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ConsistentPose:
+    """A pose elsewhere that the image fits too, with so many keypoints."""
+
+    world_from_camera: FloatArray
+    inliers: int
+
+
+@dataclass(frozen=True, slots=True)
 class Candidate:
     """A keyframe that the coarse step proposed, and what the fine step made of it."""
 
@@ -234,6 +250,7 @@ class Localization:
     timing_ms: Mapping[str, float]
     evidence: Mapping[str, float] = field(default_factory=dict)  # what verdict and confidence were made from
     refinements: Mapping[str, str] = field(default_factory=dict)  # what became of those of the map: used, stale, none
+    others: tuple[ConsistentPose, ...] = ()  # poses elsewhere that stand against this one, most keypoints first
     # for plots: the best keyframe and its inlier pairs (pixels as seen)
     best_keyframe_id: int | None = None
     query_xy: Float32Array | None = None  # [m, 2]

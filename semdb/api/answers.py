@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from semdb.database.records import KeyframeHead
 from semdb.database.store import Store
 from semdb.door.values import Answer, Keyframe, KeyframeContent, SeenObject, frozen
-from semdb.types import Camera, Float32Array, ImageArray, Keypoints
+from semdb.types import Camera, ConsistentPose, Float32Array, ImageArray, Keypoints
 
 if TYPE_CHECKING:
     from semdb.localization.images import ImageLocalization
@@ -53,6 +53,7 @@ def answer_of(found: ImageLocalization, store: Callable[[], Store]) -> Answer:
         ranked_share=localization.ranked_share,
         keyframes_matched=localization.keyframes_matched,
         refinements=localization.refinements,
+        others=tuple(ConsistentPose(frozen(other.world_from_camera), other.inliers) for other in localization.others),
         timing_ms=localization.timing_ms,
         frame_index=query.frame_index,
         timestamp_ns=query.timestamp_ns,

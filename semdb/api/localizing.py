@@ -39,6 +39,7 @@ class Localizing(Base):
         depth_scale: float | None = None,
         like: PathText | None = None,
         coarse: str = "index",
+        accept: tuple[float, float] | None = None,
         name: str | None = None,
         log: bool = True,
     ) -> Answer: ...
@@ -54,6 +55,7 @@ class Localizing(Base):
         depth_scale: float | None = None,
         like: PathText | None = None,
         coarse: str = "index",
+        accept: tuple[float, float] | None = None,
         name: Sequence[str] | None = None,
         log: bool = True,
     ) -> list[Answer]: ...
@@ -68,6 +70,7 @@ class Localizing(Base):
         depth_scale: float | None = None,
         like: PathText | None = None,
         coarse: str = "index",
+        accept: tuple[float, float] | None = None,
         name: Any = None,
         log: bool = True,
     ) -> Answer | list[Answer]:
@@ -79,7 +82,8 @@ class Localizing(Base):
         k1, k2, p1, p2[, k3]])`` in pixels, a `Camera` or a matrix ``[3, 3]``; `like` the name or folder of a recording
         whose camera took the image; without both it is the one camera of the map's keyframes. `map` None asks every
         map. `coarse` is ``index`` (from memory) or ``sql``; both answer alike. `name` is what an array is called in the
-        answer and in the log of queries, which `log` False leaves out.
+        answer and in the log of queries, which `log` False leaves out. Poses that differ by no more than `accept`
+        (metres, degrees) are one for the caller: an answer is ambiguous only if others than these fit as well.
 
         An image that cannot be localized is an answer, ``failed``. Raises FrameError for an image, depth or camera that
         cannot be used, NotFoundError for a map that is not there or empty, ProvenanceError for other models than the
@@ -98,6 +102,7 @@ class Localizing(Base):
             depth_scale=depth_scale,
             like=like,
             coarse=coarse,
+            accept=accept,
             names=None if names is None else list(names),
             log=log,
         )
@@ -120,6 +125,7 @@ class Localizing(Base):
         depth_scale: float | None = None,
         like: PathText | None = None,
         coarse: str = "index",
+        accept: tuple[float, float] | None = None,
         names: Sequence[str | None] | None = None,
         log: bool = True,
         unreadable: Callable[[FrameError], None] | None = None,
@@ -144,6 +150,7 @@ class Localizing(Base):
             camera,
             like,
             coarse,
+            accept=accept,
             depth_scale=depth_scale,
             paths=[Path(image) for image in images if isinstance(image, str | PathLike)],
             log=log,
@@ -161,6 +168,7 @@ class Localizing(Base):
         every: int = 1,
         query_depth: bool = False,
         coarse: str = "index",
+        accept: tuple[float, float] | None = None,
         log: bool = True,
         unreadable: Callable[[FrameError], None] | None = None,
     ) -> Iterator[Answer]:
@@ -175,7 +183,7 @@ class Localizing(Base):
         if every < 1:
             raise UsageError(f"every={every}: one frame in how many? From 1 on")
         items = (partial(read_frame, opened, entry, query_depth) for entry in opened.entries[::every])
-        return self._answers(items, map, None, None, coarse, log=log, unreadable=unreadable)
+        return self._answers(items, map, None, None, coarse, accept=accept, log=log, unreadable=unreadable)
 
     def open_recording(
         self,
@@ -216,16 +224,19 @@ class Localizing(Base):
         like: PathText | None,
         coarse: str,
         *,
+        accept: tuple[float, float] | None = None,
         depth_scale: float | None = None,
         paths: Sequence[Path] = (),
         log: bool,
         unreadable: Callable[[FrameError], None] | None,
     ) -> Iterator[Answer]:
         """Reads the items one after the other and asks the maps as they are then."""
+        from semdb.localization.acceptance import as_tolerance
         from semdb.localization.open_maps import ask
         from semdb.localization.query_image import QueryReader
         from semdb.recordings.arrays import as_camera
 
+        tolerance = None if accept is None else as_tolerance(accept)
         store, open_maps = self._store(), self._here.maps()
         maps = open_maps.asked(map, coarse)
         reader = QueryReader(
@@ -249,7 +260,7 @@ class Localizing(Base):
                 continue
             decode_ms = (time.perf_counter() - started) * 1000
             maps = open_maps.asked(map, coarse) if number else maps  # as they are now
-            found = ask(maps, query, lambda entry: open_maps.cameras([entry]), self._say)
+            found = ask(maps, query, lambda entry: open_maps.cameras([entry]), self._say, tolerance)
             timing = {"decode": decode_ms, **found.description.timing_ms, **found.localization.timing_ms}
             timing["total"] = (time.perf_counter() - started) * 1000
             found = replace(found, localization=replace(found.localization, timing_ms=timing))

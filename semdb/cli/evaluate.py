@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from semdb.cli.options import CameraOption, Overrides, Reading, open_database, reading_options, settings_options
+from semdb.cli.options import (
+    AcceptOption,
+    CameraOption,
+    Overrides,
+    Reading,
+    open_database,
+    reading_options,
+    settings_options,
+)
 from semdb.shown import number
 
 if TYPE_CHECKING:
@@ -59,6 +67,7 @@ def command(
     max_queries: Annotated[
         int | None, typer.Option("--max-queries", metavar="N", help="N queries, evenly spaced; default: all.")
     ] = None,
+    accept: AcceptOption = None,
     coarse: Annotated[
         str, typer.Option("--coarse", metavar="sql|index", help="Coarse step in SQL, or from a mirror in memory.")
     ] = "sql",
@@ -87,6 +96,7 @@ def command(
     from semdb.evaluation.methods import ABLATION
     from semdb.evaluation.runner import EvaluateOptions
     from semdb.evaluation.worst import WORST
+    from semdb.localization.acceptance import parse_tolerance
     from semdb.recordings import parse_camera
 
     settings = overrides.settings()
@@ -96,6 +106,7 @@ def command(
         keyframes=tuple(parse_counts(keyframes)),
         max_queries=max_queries,
         coarse=coarse,
+        accept=None if accept is None else parse_tolerance(accept),
         camera=None if camera is None else parse_camera(camera),
         reading=reading,
         query_depth=query_depth,
@@ -253,6 +264,7 @@ def used_settings(settings: Settings, options: EvaluateOptions) -> dict[str, str
     return {
         "coarse": options.coarse,
         "query depth": "yes" if options.query_depth else "no",
+        "accepted": "-" if options.accept is None else f"{options.accept.metres:g} m, {options.accept.degrees:g} deg",
         "truth": options.truth,
         "database": settings.database_url.partition(":")[0],
         "score threshold": number(settings.score_threshold),

@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 import typer
 
 from semdb.cli.options import (
+    AcceptOption,
     CameraOption,
     JsonFlag,
     Overrides,
     Reading,
+    accepted,
     open_database,
     reading_options,
     settings_options,
@@ -57,6 +59,7 @@ def command(
     coarse: Annotated[
         str, typer.Option("--coarse", metavar="sql|index", help="Coarse step in SQL, or from a mirror in memory.")
     ] = "sql",
+    accept: AcceptOption = None,
     trajectory: Annotated[
         Path | None,
         typer.Option("--trajectory", metavar="FILE", help="Write the poses of a recording in TUM's format."),
@@ -81,7 +84,7 @@ def command(
             )
         plot.mkdir(parents=True, exist_ok=True)
     tally = Tally()
-    asked = Asked(map_name, tuple(depth or ()), like, camera, reading, every, query_depth, coarse)
+    asked = Asked(map_name, tuple(depth or ()), like, camera, reading, every, query_depth, coarse, accepted(accept))
     with open_database(overrides.settings()) as database:
         if trajectory is not None:
             check_one_world(database, map_name)
@@ -167,6 +170,7 @@ class Asked:
     every: int
     query_depth: bool
     coarse: str
+    accept: tuple[float, float] | None
 
     def answers(self, database: Database, group: Group, tally: Tally) -> Iterator[Answer]:
         """The answers one by one, with progress where nobody sees them; what cannot be read is said and counted."""
@@ -200,6 +204,7 @@ class Asked:
                 every=self.every,
                 query_depth=self.query_depth,
                 coarse=self.coarse,
+                accept=self.accept,
                 unreadable=unreadable,
             )
             return len(opened.entries[:: self.every]), answers
@@ -212,6 +217,7 @@ class Asked:
             camera=self.camera,
             like=self.like,
             coarse=self.coarse,
+            accept=self.accept,
             unreadable=unreadable,
         )
         return len(images), answers

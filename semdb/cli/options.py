@@ -67,6 +67,26 @@ CameraOption = Annotated[
         help="Intrinsics in pixels and lens distortion, instead of those known for the data set.",
     ),
 ]
+AcceptOption = Annotated[
+    str | None,
+    typer.Option(
+        "--accept",
+        metavar="0.1m,5deg",
+        help="Poses that differ by no more are one: ambiguous only if others fit as well.",
+    ),
+]
+
+
+def accepted(text: str | None) -> tuple[float, float] | None:
+    """Metres and degrees of ``0.1m,5deg``. Raises UsageError for other text."""
+    from semdb.localization.acceptance import parse_tolerance
+
+    if text is None:
+        return None
+    tolerance = parse_tolerance(text)
+    return tolerance.metres, tolerance.degrees
+
+
 _READING_PANEL = "How the recording is to be read"
 
 

@@ -17,6 +17,7 @@ from semdb.types import (
     BoolArray,
     Camera,
     Candidate,
+    ConsistentPose,
     Detection,
     Float32Array,
     FloatArray,
@@ -97,8 +98,9 @@ class Answer:
     The pose is metres in the map's world frame, camera axes x right, y down, z forward; the covariance is of
     translation (m), then rotation (rad, left perturbation in the world frame). `confidence` is the probability 0..1
     that the pose is right. `objects` are those that were seen in the image, `candidates` the keyframes that were looked
-    at. `timing_ms` has the wall time of each part and their `total`. Of a frame of a recording `frame_index` is its
-    number and `timestamp_ns` its time, where the recording has times.
+    at, `others` the poses elsewhere that stand against this one, most keypoints first. `timing_ms` has the wall time of
+    each part and their `total`. Of a frame of a recording `frame_index` is its number and `timestamp_ns` its time,
+    where the recording has times.
     """
 
     image: str  # its path, or the name that was given with the array
@@ -118,6 +120,7 @@ class Answer:
     timing_ms: Mapping[str, float]
     frame_index: int | None = None
     timestamp_ns: int | None = None
+    others: tuple[ConsistentPose, ...] = ()
     draw: Callable[[], ImageArray] | None = field(default=None, repr=False)
 
     @property
@@ -169,6 +172,14 @@ class Answer:
             "pose": None
             if self.position is None or self.quat_wxyz is None
             else {"position": self.position.tolist(), "quat_wxyz": self.quat_wxyz.tolist()},
+            "others": [
+                {
+                    "position": other.world_from_camera[:3, 3].tolist(),
+                    "quat_wxyz": quat_wxyz_from_rotation(other.world_from_camera[:3, :3]).tolist(),
+                    "inliers": other.inliers,
+                }
+                for other in self.others
+            ],
             "covariance": None if self.covariance is None else self.covariance.tolist(),
             "confidence": self.confidence,
             "inliers": self.inliers,

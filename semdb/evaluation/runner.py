@@ -22,7 +22,7 @@ from semdb.perception.model_choice import specs_for_ingest
 from semdb.recordings.base import Recording
 from semdb.recordings.options import AS_THE_FORMAT_SAYS, ReadOptions
 from semdb.settings import Settings
-from semdb.types import Camera
+from semdb.types import Camera, Tolerance
 
 BOTH = "both"
 TRUTHS = (GIVEN, REFINED, BOTH)
@@ -36,14 +36,15 @@ class EvaluateOptions:
     """`query_depth` gives the queries of every method their depth images; otherwise a query is one colour image.
 
     `keyframes` are numbers to run one by one, None for what the protocol chooses. `map_from` and `query_from` are
-    folders for protocol `split`. `truth` is ``given``, ``refined`` or ``both``. `pictures` is how many of the worst
-    queries are drawn.
+    folders for protocol `split`. Poses within `accept` are one. `truth` is ``given``, ``refined`` or ``both``.
+    `pictures` is how many of the worst queries are drawn.
     """
 
     methods: tuple[str, ...] = (SEMDB,)
     keyframes: tuple[int | None, ...] = (None,)
     max_queries: int | None = None
     coarse: str = "sql"
+    accept: Tolerance | None = None
     camera: Camera | None = None
     reading: ReadOptions = AS_THE_FORMAT_SAYS
     query_depth: bool = False
@@ -190,7 +191,7 @@ def _open(
     options: EvaluateOptions,
     progress: Progress | None,
 ) -> Run:
-    return open_run(method, task, describers, store, options.coarse, options.query_depth, progress)
+    return open_run(method, task, describers, store, options.coarse, options.query_depth, progress, options.accept)
 
 
 def _answer(

@@ -23,7 +23,7 @@ from semdb.perception.describe import Describer, describer_from_specs
 from semdb.refinement.run import refine_map
 from semdb.refinement.steps import FOR_LOCALIZATION, LANDMARKS
 from semdb.settings import Settings
-from semdb.types import Camera, Description, Detection, FloatArray, Frame, Localization, ModelInfo
+from semdb.types import Camera, Description, Detection, FloatArray, Frame, Localization, ModelInfo, Tolerance
 
 Progress = Callable[[str, int, int], None]
 Described = dict[tuple[int, bool], tuple[Description, float]]  # by describer and whether depth was given
@@ -208,6 +208,7 @@ def open_run(
     coarse: str,
     query_depth: bool,
     progress: Progress | None,
+    accept: Tolerance | None = None,
 ) -> Run:
     """The method on the keyframes of `task`, which go into `store` unless another method brought them there."""
     if method.name in (SIFT_REFERENCE, COLMAP):
@@ -226,7 +227,7 @@ def open_run(
     map_name = describer.features.info.name  # one map per kind of features: rows of two kinds do not mix
     if all(info.name != map_name for info in store.maps()):
         _fill(map_name, task, describer, store, progress)
-    options = method.options.with_threads(describers.settings.threads)
+    options = replace(method.options.with_threads(describers.settings.threads), accept=accept)
     localizer = make_localizer(store, store.find_map(map_name), coarse, options)
     run = OracleRun if method.name.startswith(ORACLE) else LocalizerRun
     return run(method, describer, localizer, query_depth or method.query_depth, store)

@@ -9,7 +9,7 @@ from semdb.localization.edge_alignment import EdgeFit, EdgeOptions
 from semdb.localization.laid_pose import LaidOptions, LaidPose, Standing, compare, covariance_from, shared_doubts
 from semdb.localization.matching import Matches
 from semdb.localization.views import KeyframeView, View
-from semdb.types import FloatArray
+from semdb.types import FloatArray, Tolerance
 
 POINTS_PER_EDGE = 30.0  # whose errors are alike: the depth of an edge, and keyframes' poses
 
@@ -35,6 +35,7 @@ def weigh_edges(
     matches: Sequence[Matches],
     options: EdgeVerdictOptions,
     limits: tuple[float, float],
+    accept: Tolerance | None = None,
 ) -> LaidPose | None:
     """The best of `fits`, weighed with the pairs of first matching; `limits` (m, deg) of its standard deviations.
 
@@ -43,7 +44,7 @@ def weigh_edges(
     if not fits:
         return None
     poses, scores = [fit.world_from_camera for fit in fits], [fit.hit for fit in fits]
-    standing = compare(poses, scores, query, keyframes, matches, options)
+    standing = compare(poses, scores, query, keyframes, matches, options, accept)
     fit = fits[standing.best]
     covariance = covariance_of(fit)
     gain = fit.hit - (at_keypoints.hit if at_keypoints is not None else 0.0)
@@ -52,7 +53,7 @@ def weigh_edges(
         world_from_camera=fit.world_from_camera,
         covariance=covariance,
         support=standing.support,
-        rival_support=standing.rival,
+        others=standing.others,
         doubts=tuple(_doubts(fit, covariance, standing, options, limits)),
         fits_well=fit.seen >= options.least_seen and contradicts,
         agrees=f"{fit.hit:.0%} of the map's edges lie where they are seen",

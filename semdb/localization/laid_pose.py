@@ -16,7 +16,7 @@ from semdb.localization.pose_options import PoseOptions
 from semdb.localization.surface_alignment import moved
 from semdb.localization.verdict import Judgement
 from semdb.localization.views import KeyframeView, View
-from semdb.types import FloatArray, Verdict
+from semdb.types import ConsistentPose, FloatArray, Tolerance, Verdict
 
 WEIGHT_OF_SUPPORT = 0.25  # of the logarithm of keypoints against shares, where poses are compared
 LOGIT, LOGIT_OF_SUPPORT = 0.0, 1.5
@@ -38,19 +38,25 @@ class LaidOptions:
     same_m: float = 0.05  # the keypoints' own pose is this one if it is no further off
     same_deg: float = 3.0
 
+    def tolerance(self, accept: Tolerance | None) -> Tolerance:
+        """How far poses may differ that are one: what the caller would accept, at least these bounds."""
+        if accept is None:
+            return Tolerance(self.same_m, self.same_deg)
+        return Tolerance(max(self.same_m, accept.metres), max(self.same_deg, accept.degrees))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LaidPose:
     """The best pose of what was laid on the map. `doubts` are in words; without any it is sure.
 
-    `support` counts distinct keypoints of the query that first matching gave and this pose puts where they are,
-    `rival_support` the same of a pose elsewhere that may be the right one instead, 0 without any.
+    `support` counts distinct keypoints of the query that first matching gave and this pose puts where they are;
+    `others` are poses elsewhere, one of which may be the right one instead.
     """
 
     world_from_camera: FloatArray
     covariance: FloatArray
     support: int
-    rival_support: int
+    others: tuple[ConsistentPose, ...]
     doubts: tuple[str, ...]
     fits_well: bool  # whatever the place
     agrees: str  # what does, for people
@@ -79,6 +85,7 @@ class Standing:
     best: int
     support: int
     rival: int
+    others: tuple[ConsistentPose, ...] = ()  # that are rivals, most keypoints first
 
 
 def compare(
@@ -88,19 +95,29 @@ def compare(
     keyframes: Sequence[KeyframeView],
     matches: Sequence[Matches],
     options: LaidOptions,
+    accept: Tolerance | None = None,
 ) -> Standing:
-    """The best of `poses` ``[4, 4]`` by `scores` (shares) and by pairs of first matching; there is at least one."""
+    """The best of `poses` ``[4, 4]`` by `scores` (shares) and by pairs of first matching; there is at least one.
+
+    One that the caller would `accept` for the best is no rival.
+    """
     supports = [support_of(pose, query, keyframes, matches, options.support_px) for pose in poses]
     worth = [score + WEIGHT_OF_SUPPORT * np.log1p(count) for score, count in zip(scores, supports, strict=True)]
     best = int(np.argmax(worth))
-    rival = 0
+    others = []
     for pose, score, count in zip(poses, scores, supports, strict=True):
-        distance, angle = pose_error(pose, poses[best])
-        elsewhere = distance > options.same_m or angle > options.same_deg
+        elsewhere = not is_one(pose, poses[best], options.tolerance(accept))
         nearly = score > scores[best] - options.rival_score
         if elsewhere and count > (options.rival_support if nearly else options.rival_alone) * supports[best]:
-            rival = max(rival, count)
-    return Standing(best, supports[best], rival)
+            others.append(ConsistentPose(pose, count))
+    others.sort(key=lambda other: -other.inliers)
+    return Standing(best, supports[best], others[0].inliers if others else 0, tuple(others))
+
+
+def is_one(pose: FloatArray, other: FloatArray, tolerance: Tolerance) -> bool:
+    """Whether two poses ``[4, 4]`` are within `tolerance`."""
+    distance, angle = pose_error(pose, other)
+    return distance <= tolerance.metres and angle <= tolerance.degrees
 
 
 def support_of(
@@ -157,13 +174,20 @@ def may_overrule(convinced: bool, evidence: Evidence, laid: LaidPose, options: L
 
 
 def judge_with(
-    judgement: Judgement, estimate: PoseEstimate | None, laid: LaidPose, options: LaidOptions, overrule: bool
+    judgement: Judgement,
+    estimate: PoseEstimate | None,
+    laid: LaidPose,
+    options: LaidOptions,
+    overrule: bool,
+    accept: Tolerance | None = None,
 ) -> Judgement:
     """What becomes of the verdict of keypoints on their `estimate`, where `laid` may `overrule` it or not."""
     if laid.is_sure and overrule:
         reason = f"{laid.agrees}, {laid.support} keypoints agree"
         return Judgement(Verdict.LOCALIZED, laid.confidence, reason)
-    elsewhere = estimate is not None and not laid.is_same(estimate.world_from_camera, options)
+    elsewhere = estimate is not None and not is_one(
+        laid.world_from_camera, estimate.world_from_camera, options.tolerance(accept)
+    )
     if judgement.verdict is Verdict.LOCALIZED and elsewhere and laid.fits_well:
         return Judgement(Verdict.AMBIGUOUS, min(judgement.confidence, 0.5), laid.better)
     return judgement

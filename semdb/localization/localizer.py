@@ -22,32 +22,40 @@ from semdb.localization.coarse import (
     query_classes,
     retrieve,
 )
-from semdb.localization.confidence import Evidence, gather_evidence
+from semdb.localization.confidence import Evidence
 from semdb.localization.edge_alignment import measure_edges, search_edges
 from semdb.localization.edge_step import EdgeVerdictOptions, weigh_edges
 from semdb.localization.edges import image_edges
 from semdb.localization.keyframe_cache import KeyframeCache
-from semdb.localization.laid_pose import LaidOptions, LaidPose, estimate_with, judge_with, may_overrule
-from semdb.localization.landmark_pose import LandmarkPose, LandmarkPoseOptions
+from semdb.localization.laid_pose import LaidOptions, LaidPose, estimate_with, is_one, judge_with, may_overrule
+from semdb.localization.landmark_pose import LandmarkPoseOptions
 from semdb.localization.landmark_step import landmark_pose
-from semdb.localization.matching import Matches
 from semdb.localization.neighbours import by_side
 from semdb.localization.pose import (
-    FirstPose,
     PoseEstimate,
     estimate_pose,
+    find_rival,
     first_pose,
     match_views,
-    rival_pose,
 )
 from semdb.localization.pose_options import PoseOptions
+from semdb.localization.search import Search, best_pairs, evidence_of, numbers_of
 from semdb.localization.sources import TimedSource
 from semdb.localization.surface_search import search_surfaces
 from semdb.localization.surface_step import SurfaceVerdictOptions, weigh_surfaces
 from semdb.localization.surfaces import Surfaces, surfaces_of
 from semdb.localization.verdict import Judgement, VerdictOptions, convinces, judge
-from semdb.localization.views import KeyframeView, View, make_view
-from semdb.types import Candidate, Description, Float32Array, FloatArray, Localization, ModelInfo, Verdict
+from semdb.localization.views import View, make_view
+from semdb.types import (
+    Candidate,
+    ConsistentPose,
+    Description,
+    FloatArray,
+    Localization,
+    ModelInfo,
+    Tolerance,
+    Verdict,
+)
 
 FAR = 4.0  # of `pose_distances`: keyframes nearer than this may see the same things
 ASKED_BY_SIDE = 6  # so many of the nearest are candidates for each neighbour
@@ -66,30 +74,12 @@ class LocalizerOptions:
     surfaces: SurfaceVerdictOptions | None = field(default_factory=SurfaceVerdictOptions)  # of a query with depth
     edges: EdgeVerdictOptions | None = field(default_factory=EdgeVerdictOptions)  # where neither convinces
     landmarks: LandmarkPoseOptions | None = field(default_factory=LandmarkPoseOptions)  # where keypoints fail
+    accept: Tolerance | None = None  # how far poses may differ that are one, where a query does not say
     twin_cosine: float = 0.05  # how much less than the best keyframe's cosine is "as much"
 
     def with_threads(self, threads: int) -> LocalizerOptions:
         """The same with so many threads for a query."""
         return replace(self, pose=replace(self.pose, threads=threads))
-
-
-@dataclass(slots=True)
-class _Search:
-    """What one query has tried so far."""
-
-    query: View
-    keyframes_in_map: int
-    laid: list[LaidPose] = field(default_factory=list)
-    by_landmarks: LandmarkPose | None = None
-    keyframes: list[KeyframeView] = field(default_factory=list)
-    matches: list[Matches] = field(default_factory=list)
-    proposals: list[Proposal] = field(default_factory=list)
-    first: FirstPose | None = None
-    estimate: PoseEstimate | None = None
-    following: tuple[Proposal, ...] = ()
-    stage: str = Stage.FILTERED
-    ranked: int = 0
-    timing_ms: dict[str, float] = field(default_factory=lambda: {"filter": 0.0, "rank": 0.0, "match": 0.0, "pose": 0.0})
 
 
 class Localizer:
@@ -115,13 +105,13 @@ class Localizer:
         self.options = options or LocalizerOptions()
         self.confusions = confusions or {}  # class -> classes it is taken for -> weight in millionths
 
-    def localize(self, description: Description) -> Localization:
-        """The pose of `description` in the map.
+    def localize(self, description: Description, accept: Tolerance | None = None) -> Localization:
+        """The pose of `description` in the map; poses within `accept` are one for the caller.
 
         Raises ProvenanceError when other models made the map, NotFoundError when the map holds no keyframe, CodecError
         where none that can be used is found among damaged ones.
         """
-        search = _Search(self._view_of(description), self._check(description))
+        search = Search(self._view_of(description), self._check(description), accept or self.options.accept)
         source = TimedSource(self.source)
         started = time.perf_counter()
         for batch in cascade(source, self._classes(description), description.cnn_vector, self.options.coarse):
@@ -148,7 +138,7 @@ class Localizer:
 
     def localize_among(self, description: Description, keyframe_ids: Sequence[int]) -> Localization:
         """The fine step alone, on keyframes that the caller names (the `oracle` of evaluations)."""
-        search = _Search(self._view_of(description), self._check(description))
+        search = Search(self._view_of(description), self._check(description), self.options.accept)
         proposals = tuple(Proposal(i, float("nan"), float("nan")) for i in keyframe_ids)
         self._try(search, Batch(Stage.GIVEN, proposals, 0))
         return self._conclude(search, description)
@@ -174,7 +164,7 @@ class Localizer:
             description.camera, description.keypoints, categories, self.cache.numbers, grey=description.grey
         )
 
-    def _try(self, search: _Search, batch: Batch) -> None:
+    def _try(self, search: Search, batch: Batch) -> None:
         search.stage, search.ranked = batch.stage, batch.ranked
         search.proposals += batch.proposals
         search.following = batch.following
@@ -183,14 +173,14 @@ class Localizer:
         search.first = first_pose(search.query, search.keyframes, search.matches, self.options.pose)
         search.timing_ms["pose"] += _ms_since(started)
 
-    def _match(self, search: _Search, keyframe_ids: Sequence[int]) -> None:
+    def _match(self, search: Search, keyframe_ids: Sequence[int]) -> None:
         started = time.perf_counter()
         keyframes = self.cache.views(keyframe_ids, search.query.descriptors)
         search.keyframes += keyframes
         search.matches += match_views(search.query, keyframes, self.options.pose)
         search.timing_ms["match"] += _ms_since(started)
 
-    def _conclude(self, search: _Search, description: Description) -> Localization:
+    def _conclude(self, search: Search, description: Description) -> Localization:
         damaged = [p.keyframe_id for p in search.proposals if p.keyframe_id in self.cache.left_out]
         if damaged and not search.keyframes:
             raise self.cache.left_out[damaged[0]]
@@ -201,11 +191,13 @@ class Localizer:
         if convinced:
             self._ask_twins(search)
         started = time.perf_counter()
-        rival = 0
+        evidence, bounds = None, self.options.verdict.accepting(search.accept)
         if search.estimate is not None:
-            rival = rival_pose(search.query, search.keyframes, search.matches, search.estimate, self.options.pose)
-        evidence = None if search.estimate is None else _evidence(search, search.estimate, rival)
-        judgement = judge(evidence, self.options.verdict)
+            rival = self._rival(search, search.estimate)
+            evidence = evidence_of(search, search.estimate, 0 if rival is None else rival.inliers)
+            if rival is not None and rival.inliers > bounds.rival_share * evidence.first_of_best:
+                search.others.append(rival)
+        judgement = judge(evidence, bounds)
         if not convinced or judgement.verdict is not Verdict.LOCALIZED:
             for lay, options in ((self._lay_surfaces, self.options.surfaces), (self._lay_edges, self.options.edges)):
                 laid = lay(search, description) if search.keyframes else None
@@ -219,7 +211,7 @@ class Localizer:
             judgement = self._by_landmarks(search, description, judgement)
         return self._result(search, judgement, evidence)
 
-    def _by_landmarks(self, search: _Search, description: Description, judgement: Judgement) -> Judgement:
+    def _by_landmarks(self, search: Search, description: Description, judgement: Judgement) -> Judgement:
         """What landmarks make of an image whose keypoints failed; its confidence stays that of the keypoints."""
         if self.options.landmarks is None:
             return judgement
@@ -237,7 +229,7 @@ class Localizer:
 
     def _with_laid(
         self,
-        search: _Search,
+        search: Search,
         laid: LaidPose,
         options: LaidOptions,
         convinced: bool,
@@ -250,14 +242,25 @@ class Localizer:
         if laid.is_sure:
             pose = self.options.pose
             found = estimate_with(laid, search.query, search.keyframes, search.matches, options, pose)
-            rival = rival_pose(search.query, search.keyframes, search.matches, found, pose)
-            anew = _evidence(search, found, rival)
+            rival = self._rival(search, found)
+            anew = evidence_of(search, found, 0 if rival is None else rival.inliers)
             overrule = may_overrule(convinced, anew, laid, options)
             if overrule:
                 search.estimate, evidence = found, anew
-        return judge_with(judgement, before, laid, options, overrule), evidence
+                search.others.clear()
+        after = judge_with(judgement, before, laid, options, overrule, search.accept)
+        if after is not judgement and after.verdict is Verdict.AMBIGUOUS:
+            search.others.append(ConsistentPose(laid.world_from_camera, laid.support))
+        return after, evidence
 
-    def _lay_surfaces(self, search: _Search, description: Description) -> LaidPose | None:
+    def _rival(self, search: Search, estimate: PoseEstimate) -> ConsistentPose | None:
+        """The best pose elsewhere that the caller would not accept for `estimate`."""
+        found = find_rival(search.query, search.keyframes, search.matches, estimate, self.options.pose)
+        if found is None or search.accept is None:
+            return found
+        return None if is_one(found.world_from_camera, estimate.world_from_camera, search.accept) else found
+
+    def _lay_surfaces(self, search: Search, description: Description) -> LaidPose | None:
         """The pose of a query's depth on the surfaces of the map, where it has depth."""
         options = self.options.surfaces
         surfaces = None if options is None else self._surfaces_of(description)
@@ -265,9 +268,10 @@ class Localizer:
             return None
         starts, fit = self._starts(search, options.fit.starts), options.fit
         fits = search_surfaces(surfaces, starts, lambda pose: self.cache.surfaces_near(pose, fit.keyframes), fit)
-        return weigh_surfaces(fits, search.query, search.keyframes, search.matches, options, self._limits())
+        limits, accept = self._limits(search), search.accept
+        return weigh_surfaces(fits, search.query, search.keyframes, search.matches, options, limits, accept)
 
-    def _lay_edges(self, search: _Search, description: Description) -> LaidPose | None:
+    def _lay_edges(self, search: Search, description: Description) -> LaidPose | None:
         """The pose of a query's edges on those of the map."""
         options = self.options.edges
         if options is None or description.grey is None:
@@ -279,11 +283,13 @@ class Localizer:
         if search.estimate is not None:
             pose = search.estimate.world_from_camera
             own = measure_edges(edges, self.cache.edges_near(pose, fit.keyframes), pose, fit.fine[-1])
-        return weigh_edges(fits, own, search.query, search.keyframes, search.matches, options, self._limits())
+        return weigh_edges(
+            fits, own, search.query, search.keyframes, search.matches, options, self._limits(search), search.accept
+        )
 
-    def _limits(self) -> tuple[float, float]:
+    def _limits(self, search: Search) -> tuple[float, float]:
         """What standard deviations (m, deg) a pose may have that is sure."""
-        bounds = self.options.verdict
+        bounds = self.options.verdict.accepting(search.accept)
         return bounds.maximum_translation_sigma_m, bounds.maximum_rotation_sigma_deg
 
     def _surfaces_of(self, description: Description) -> Surfaces | None:
@@ -292,7 +298,7 @@ class Localizer:
             return None
         return surfaces_of(description.camera, description.depth, description.grey)
 
-    def _starts(self, search: _Search, keyframes: int) -> list[FloatArray]:
+    def _starts(self, search: Search, keyframes: int) -> list[FloatArray]:
         """Poses from which a query is laid: that of the keypoints, and those of the likeliest keyframes."""
         estimate = search.estimate
         order = list(range(len(search.keyframes)))
@@ -302,7 +308,7 @@ class Localizer:
         starts = [] if estimate is None else [estimate.world_from_camera]
         return starts + [search.keyframes[slot].world_from_camera for slot in order[:keyframes]]
 
-    def _ask_neighbours(self, search: _Search) -> None:
+    def _ask_neighbours(self, search: Search) -> None:
         """Keyframes near the first pose see the same things from elsewhere: their pairs steady the pose."""
         if search.first is None or self.options.neighbours == 0:
             return
@@ -315,7 +321,7 @@ class Localizer:
             search.proposals += [Proposal(i, float("nan"), float("nan")) for i in chosen]
             self._match(search, chosen)
 
-    def _estimate(self, search: _Search) -> None:
+    def _estimate(self, search: Search) -> None:
         """The last pose, of all that was matched; without the neighbours where these take support away."""
         if search.first is None:
             return
@@ -331,7 +337,7 @@ class Localizer:
                 break
         search.timing_ms["pose"] += _ms_since(started)
 
-    def _ask_twins(self, search: _Search) -> None:
+    def _ask_twins(self, search: Search) -> None:
         """A keyframe far from the pose that looks as much like the query may show a place that is the same twice.
 
         Its pairs do not join the pose; they are there for `rival_pose`. On the recordings of README.md the
@@ -349,7 +355,7 @@ class Localizer:
             search.proposals += chosen
             self._match(search, [proposal.keyframe_id for proposal in chosen])
 
-    def _result(self, search: _Search, judgement: Judgement, evidence: Evidence | None) -> Localization:
+    def _result(self, search: Search, judgement: Judgement, evidence: Evidence | None) -> Localization:
         coarse = search.by_landmarks if judgement.verdict is Verdict.COARSE else None
         estimate = search.estimate if judgement.verdict not in (Verdict.FAILED, Verdict.COARSE) else None
         pose = coarse if coarse is not None else estimate
@@ -358,7 +364,7 @@ class Localizer:
             ids = [keyframe.keyframe_id for keyframe in search.keyframes]
             inliers.update(zip(ids, estimate.per_keyframe, strict=False))
         best = max(inliers, key=lambda i: inliers[i]) if estimate is not None else None
-        query_xy, keyframe_xy = _best_pairs(search, estimate, best)
+        query_xy, keyframe_xy = best_pairs(search, estimate, best)
         return Localization(
             verdict=judgement.verdict,
             map_name=self.map_name,
@@ -372,14 +378,15 @@ class Localizer:
             keyframes_matched=len(search.keyframes),
             reason=judgement.reason,
             timing_ms=search.timing_ms,
-            evidence=_numbers(search, evidence),
+            evidence=numbers_of(search, evidence),
             refinements={"points": self.cache.points},
+            others=tuple(sorted(search.others, key=lambda other: -other.inliers)) if estimate is not None else (),
             best_keyframe_id=best,
             query_xy=query_xy,
             keyframe_xy=keyframe_xy,
         )
 
-    def _candidates(self, search: _Search, inliers: dict[int, int]) -> tuple[Candidate, ...]:
+    def _candidates(self, search: Search, inliers: dict[int, int]) -> tuple[Candidate, ...]:
         return tuple(
             Candidate(
                 keyframe_id=proposal.keyframe_id,
@@ -391,31 +398,6 @@ class Localizer:
             )
             for proposal in search.proposals
         )
-
-
-def _numbers(search: _Search, evidence: Evidence | None) -> dict[str, float]:
-    """All evidence, of keypoints, of what was laid, and of landmarks."""
-    found = evidence.as_mapping() if evidence else {}
-    for laid in search.laid:
-        found |= laid.numbers
-    return found | (search.by_landmarks.as_mapping() if search.by_landmarks else {})
-
-
-def _evidence(search: _Search, estimate: PoseEstimate, rival: int) -> Evidence:
-    cosines = {proposal.keyframe_id: proposal.cosine for proposal in search.proposals}
-    known = [cosines[keyframe.keyframe_id] for keyframe in search.keyframes]
-    return gather_evidence(search.query, search.keyframes, estimate, rival, known)
-
-
-def _best_pairs(
-    search: _Search, estimate: PoseEstimate | None, best: int | None
-) -> tuple[Float32Array | None, Float32Array | None]:
-    """Pixels as seen of the inlier pairs with the best keyframe, for pictures."""
-    if estimate is None or best is None:
-        return None, None
-    slot = next(s for s, keyframe in enumerate(search.keyframes) if keyframe.keyframe_id == best)
-    pairs = estimate.pairs.take(estimate.pairs.slot == slot)
-    return search.query.seen_xy[pairs.query], search.keyframes[slot].view.seen_xy[pairs.keypoint]
 
 
 def _ms_since(started: float) -> float:

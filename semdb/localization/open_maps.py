@@ -22,7 +22,7 @@ from semdb.names import storable
 from semdb.perception.describe import Describer, describer_from_specs
 from semdb.perception.model_choice import settings_of_map, specs_for_query
 from semdb.settings import Settings
-from semdb.types import Camera, Description, Localization, Verdict
+from semdb.types import Camera, Description, Localization, Tolerance, Verdict
 
 RIVAL_CONFIDENCE = 0.5  # at most, where another map fits as well
 
@@ -177,12 +177,13 @@ def ask(
     query: QueryImage,
     cameras: Callable[[OpenMap], Sequence[Camera]] | None = None,
     say: Callable[[str], None] | None = None,
+    accept: Tolerance | None = None,
 ) -> ImageLocalization:
     """The best answer of all `maps`; two maps that both know the place make it ambiguous.
 
     `query` is no finer than the finest of them; of several, `cameras` says what took the images of each, so that each
-    is asked at its own scale. A map that is too damaged to answer is left out and told to `say` where another one
-    answers. Raises FrameError, ModelError, DatabaseError.
+    is asked at its own scale. Poses within `accept` are one for the caller. A map that is too damaged to answer is left
+    out and told to `say` where another one answers. Raises FrameError, ModelError, DatabaseError.
     """
     described: dict[tuple[Describer, Camera], Description] = {}
     answers: list[tuple[QueryImage, Description, Localization]] = []
@@ -194,7 +195,7 @@ def ask(
         if key not in described:
             described[key] = entry.describer.describe(scaled.image, scaled.depth, scaled.camera, scaled.instances)
         try:
-            answers.append((scaled, described[key], entry.localizer.localize(described[key])))
+            answers.append((scaled, described[key], entry.localizer.localize(described[key], accept)))
         except CodecError as error:
             refused.append(error)
             if say is not None and len(maps) > 1:

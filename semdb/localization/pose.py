@@ -18,7 +18,7 @@ from semdb.localization.pairs import Pairs, guided_pairs, join_pairs, reprojecti
 from semdb.localization.pose_options import PoseOptions
 from semdb.localization.views import KeyframeView, View
 from semdb.threads import each
-from semdb.types import BoolArray, FloatArray, IntArray
+from semdb.types import BoolArray, ConsistentPose, FloatArray, IntArray
 
 MINIMUM_PAIRS = 6  # below, a pose from 3 points has nothing to be checked with
 RIVAL_SHARE = 0.2  # of the first inliers with the best keyframe: a rival with fewer says nothing and may be missed
@@ -296,10 +296,22 @@ def rival_pose(
     best: PoseEstimate,
     options: PoseOptions,
 ) -> int:
-    """Inliers (distinct query keypoints) of the best pose elsewhere, among the pairs that `best` leaves over.
+    """Inliers of `find_rival`; 0 when there is none."""
+    found = find_rival(query, keyframes, matches, best, options)
+    return 0 if found is None else found.inliers
 
-    Elsewhere is more than 0.5 m or 15 degrees away; 0 when there is none. It is looked for as long as it takes to find
-    one that counts.
+
+def find_rival(
+    query: View,
+    keyframes: Sequence[KeyframeView],
+    matches: Sequence[Matches],
+    best: PoseEstimate,
+    options: PoseOptions,
+) -> ConsistentPose | None:
+    """The best pose elsewhere, among the pairs that `best` leaves over; inliers are distinct keypoints of the query.
+
+    Elsewhere is more than 0.5 m or 15 degrees away; None when there is none. It is looked for as long as it takes to
+    find one that counts.
     """
     pairs = join_pairs(matches)
     points = world_points_of(pairs, keyframes)
@@ -308,12 +320,12 @@ def rival_pose(
     iterations = _iterations_for(RIVAL_SHARE * best.first_of_best / max(int(left.sum()), 1))
     found = robust_pnp(query, pairs.take(left), points[left], options, iterations)
     if found is None:
-        return 0
-    rival, agreeing = found
-    distance, angle = pose_error(invert_pose(rival), best.world_from_camera)
+        return None
+    world_from_camera = invert_pose(found[0])
+    distance, angle = pose_error(world_from_camera, best.world_from_camera)
     if distance < 0.5 and angle < 15:
-        return 0
-    return len(np.unique(pairs.take(left).query[agreeing]))
+        return None
+    return ConsistentPose(world_from_camera, len(np.unique(pairs.take(left).query[found[1]])))
 
 
 def _iterations_for(share: float) -> int:

@@ -9,7 +9,7 @@ from semdb.localization.laid_pose import LaidOptions, LaidPose, Standing, compar
 from semdb.localization.matching import Matches
 from semdb.localization.surface_alignment import SurfaceFit, SurfaceOptions
 from semdb.localization.views import KeyframeView, View
-from semdb.types import FloatArray
+from semdb.types import FloatArray, Tolerance
 
 POINTS_PER_CELL = 60.0  # whose errors are alike: the depth's own, and of keyframes' poses
 
@@ -32,19 +32,20 @@ def weigh_surfaces(
     matches: Sequence[Matches],
     options: SurfaceVerdictOptions,
     limits: tuple[float, float],
+    accept: Tolerance | None = None,
 ) -> LaidPose | None:
     """The best of `fits`, weighed with the pairs of first matching; `limits` (m, deg) of its standard deviations."""
     if not fits:
         return None
     poses, scores = [fit.world_from_camera for fit in fits], [fit.score for fit in fits]
-    standing = compare(poses, scores, query, keyframes, matches, options)
+    standing = compare(poses, scores, query, keyframes, matches, options, accept)
     fit = fits[standing.best]
     covariance = covariance_of(fit)
     return LaidPose(
         world_from_camera=fit.world_from_camera,
         covariance=covariance,
         support=standing.support,
-        rival_support=standing.rival,
+        others=standing.others,
         doubts=tuple(_doubts(fit, covariance, standing, options, limits)),
         fits_well=fit.near >= options.least_near and fit.through <= options.most_through,
         agrees=f"{fit.near:.0%} of the surfaces lie where they were measured",

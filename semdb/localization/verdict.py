@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from semdb.localization.confidence import Evidence, confidence_of
 from semdb.localization.pose import FirstPose, PoseEstimate
-from semdb.types import Verdict
+from semdb.types import Tolerance, Verdict
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +37,16 @@ class VerdictOptions:
     maximum_rotation_sigma_deg: float = 1.5
     localized_confidence: float = 0.82
     rival_share: float = 0.7  # of the first inliers with the best keyframe, that a pose elsewhere may have at most
+
+    def accepting(self, tolerance: Tolerance | None) -> VerdictOptions:
+        """The same for a caller who takes poses within `tolerance` for one: two standard deviations are within it."""
+        if tolerance is None:
+            return self
+        return replace(
+            self,
+            maximum_translation_sigma_m=tolerance.metres / 2,
+            maximum_rotation_sigma_deg=tolerance.degrees / 2,
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -138,6 +138,8 @@ def test_a_place_that_is_there_twice_is_ambiguous(room: Path, images: list[Path]
         assert answer["verdict"] == "ambiguous"
         assert "elsewhere" in answer["reason"]
         assert answer["confidence"] <= 0.5
+        [other, *_] = answer["others"]
+        assert abs(abs(other["position"][0] - answer["pose"]["position"][0]) - 5) < 0.1
 
 
 def test_queries_are_logged(url: str, images: list[Path]) -> None:

@@ -30,7 +30,7 @@ def pose(shift: tuple[float, float, float], turn_deg: tuple[float, float, float]
 
 
 def laid(doubts: tuple[str, ...], fits_well: bool = True) -> LaidPose:
-    return LaidPose(np.eye(4), np.eye(6) * 1e-4, 12, 0, doubts, fits_well, "90 % of it", "better elsewhere", {})
+    return LaidPose(np.eye(4), np.eye(6) * 1e-4, 12, (), doubts, fits_well, "90 % of it", "better elsewhere", {})
 
 
 def estimate_at(shift: float) -> PoseEstimate:

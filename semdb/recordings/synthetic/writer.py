@@ -146,7 +146,7 @@ def write_synthetic_recording(
     target.parent.mkdir(parents=True, exist_ok=True)
     work = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
     try:
-        _write_all(work, SyntheticSequence(options), progress)
+        write_frames(work, SyntheticSequence(options), progress)
         work.chmod(0o755)
         work.replace(target)  # an empty folder gives way, a full one does not
     finally:
@@ -182,7 +182,7 @@ def building(options: SyntheticOptions, rooms: int) -> list[SyntheticOptions]:
     return [replace(options, room_seed=options.room_seed + k, seed=options.seed + k, place=k) for k in range(rooms)]
 
 
-def _write_all(folder: Path, sequence: SyntheticSequence, progress: Callable[[int, int], None] | None) -> None:
+def write_frames(folder: Path, sequence: SyntheticSequence, progress: Callable[[int, int], None] | None) -> None:
     options, camera = sequence.options, sequence.camera
     for name in ("rgb", "depth", "masks"):
         (folder / name).mkdir()

@@ -1,0 +1,60 @@
+"""What one query has tried so far, and what is read off it in the end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from semdb.localization.coarse import Proposal, Stage
+from semdb.localization.confidence import Evidence, gather_evidence
+from semdb.localization.laid_pose import LaidPose
+from semdb.localization.landmark_pose import LandmarkPose
+from semdb.localization.matching import Matches
+from semdb.localization.pose import FirstPose, PoseEstimate
+from semdb.localization.views import KeyframeView, View
+from semdb.types import ConsistentPose, Float32Array, Tolerance
+
+
+@dataclass(slots=True)
+class Search:
+    """What one query has tried so far."""
+
+    query: View
+    keyframes_in_map: int
+    accept: Tolerance | None = None
+    others: list[ConsistentPose] = field(default_factory=list)
+    laid: list[LaidPose] = field(default_factory=list)
+    by_landmarks: LandmarkPose | None = None
+    keyframes: list[KeyframeView] = field(default_factory=list)
+    matches: list[Matches] = field(default_factory=list)
+    proposals: list[Proposal] = field(default_factory=list)
+    first: FirstPose | None = None
+    estimate: PoseEstimate | None = None
+    following: tuple[Proposal, ...] = ()
+    stage: str = Stage.FILTERED
+    ranked: int = 0
+    timing_ms: dict[str, float] = field(default_factory=lambda: {"filter": 0.0, "rank": 0.0, "match": 0.0, "pose": 0.0})
+
+
+def numbers_of(search: Search, evidence: Evidence | None) -> dict[str, float]:
+    """All evidence, of keypoints, of what was laid, and of landmarks."""
+    found = evidence.as_mapping() if evidence else {}
+    for laid in search.laid:
+        found |= laid.numbers
+    return found | (search.by_landmarks.as_mapping() if search.by_landmarks else {})
+
+
+def evidence_of(search: Search, estimate: PoseEstimate, rival: int) -> Evidence:
+    cosines = {proposal.keyframe_id: proposal.cosine for proposal in search.proposals}
+    known = [cosines[keyframe.keyframe_id] for keyframe in search.keyframes]
+    return gather_evidence(search.query, search.keyframes, estimate, rival, known)
+
+
+def best_pairs(
+    search: Search, estimate: PoseEstimate | None, best: int | None
+) -> tuple[Float32Array | None, Float32Array | None]:
+    """Pixels as seen of the inlier pairs with the best keyframe, for pictures."""
+    if estimate is None or best is None:
+        return None, None
+    slot = next(s for s, keyframe in enumerate(search.keyframes) if keyframe.keyframe_id == best)
+    pairs = estimate.pairs.take(estimate.pairs.slot == slot)
+    return search.query.seen_xy[pairs.query], search.keyframes[slot].view.seen_xy[pairs.keypoint]
