@@ -21,6 +21,7 @@ from semdb.types import ConsistentPose, FloatArray, Tolerance, Verdict
 WEIGHT_OF_SUPPORT = 0.25  # of the logarithm of keypoints against shares, where poses are compared
 LOGIT, LOGIT_OF_SUPPORT = 0.0, 1.5
 POSE_SIGMA_M, POSE_SIGMA_RAD = 0.006, 0.007  # of what keyframes share: recorded poses, clocks of colour and depth
+FEW_KEYPOINTS = 4.0  # times the covariance of keypoints where they are few: weak pairs lie along edges and agree
 SCATTER = 4.0  # times what keyframes show that disagree: neighbours err alike
 
 
@@ -155,8 +156,7 @@ def covariance_from(information: FloatArray, scatter: FloatArray, alike: float) 
     `alike` measurements err together; `scatter` is what keyframes show that disagree.
     """
     loose = np.diag([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])  # nothing is believed to be further off
-    shared = np.repeat([POSE_SIGMA_M, POSE_SIGMA_RAD], 3) ** 2
-    return np.asarray(np.linalg.inv(information / alike + loose) + np.diag(shared) + SCATTER * scatter)
+    return np.asarray(np.linalg.inv(information / alike + loose) + _shared() + SCATTER * scatter)
 
 
 def may_overrule(convinced: bool, evidence: Evidence, laid: LaidPose, options: LaidOptions) -> bool:
@@ -214,7 +214,9 @@ def estimate_with(
     start = FirstPose(camera_from_world, len(keyframes), first, laid.support, 0.0)
     found = estimate_pose(query, keyframes, matches, pose, start)
     if found is not None and found.covariance is not None and laid.is_same(found.world_from_camera, options):
-        together, covariance = fused(laid.world_from_camera, laid.covariance, found.world_from_camera, found.covariance)
+        together, _ = fused(laid.world_from_camera, laid.covariance, found.world_from_camera, found.covariance)
+        own, others = laid.covariance - _shared(), FEW_KEYPOINTS * found.covariance
+        covariance = np.linalg.inv(np.linalg.inv(own) + np.linalg.inv(others)) + _shared()  # not seen by either
         return replace(found, world_from_camera=together, covariance=covariance)
     agreeing = pairs.take(near)
     return PoseEstimate(
@@ -240,3 +242,8 @@ def fused(
     offset = np.concatenate([other[:3, 3] - laid[:3, 3], so3_log(other[:3, :3] @ laid[:3, :3].T)])
     step = covariance @ two @ offset
     return moved(laid, step), covariance
+
+
+def _shared() -> FloatArray:
+    """Covariance ``[6, 6]`` of the errors that keyframes share, which nothing that is laid on them can see."""
+    return np.diag(np.repeat([POSE_SIGMA_M, POSE_SIGMA_RAD], 3) ** 2)
