@@ -20,6 +20,7 @@ class EdgeVerdictOptions(LaidOptions):
 
     fit: EdgeOptions = field(default_factory=EdgeOptions)
     least_support: int = 8  # a thing that is turned by half a turn has most of its edges again
+    convinced_confidence: float = 1.1  # never: where keypoints are many and in doubt, equal things have equal edges
     least_seen: int = 200
     least_hit: float = 0.34
     least_explained: float = 0.75

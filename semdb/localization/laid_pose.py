@@ -34,6 +34,7 @@ class LaidOptions:
     rival_support: float = 0.4  # of the support, that a pose elsewhere may have at most that fits nearly as well,
     rival_score: float = 0.15  # by so much less,
     rival_alone: float = 0.7  # and any pose elsewhere
+    least_confidence: float = 0.1  # of keypoints at that pose: equal doors of a corridor have .01 to .05 of it
     convinced_likeness: float = 0.65  # where keypoints are many, and yet in doubt: a room of the same shapes shows
     convinced_confidence: float = 0.9  # other textures, which shapes do not see
     same_m: float = 0.05  # the keypoints' own pose is this one if it is no further off
@@ -168,9 +169,10 @@ def may_overrule(convinced: bool, evidence: Evidence, laid: LaidPose, options: L
     own = evidence.first_of_best if convinced else laid.support  # once convinced, one keyframe elsewhere was asked
     if evidence.rival > options.rival_alone * own:
         return False
-    return not convinced or (
-        evidence.likeness >= options.convinced_likeness and confidence_of(evidence) >= options.convinced_confidence
-    )
+    confidence = confidence_of(evidence)
+    if not convinced:
+        return confidence >= options.least_confidence
+    return evidence.likeness >= options.convinced_likeness and confidence >= options.convinced_confidence
 
 
 def judge_with(
