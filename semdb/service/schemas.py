@@ -222,7 +222,7 @@ class CandidateModel(Model):
 
 
 class Answer(Model):
-    """Where an image was taken. A pose only for `localized` and `ambiguous`; `failed` is an answer, too."""
+    """Where an image was taken. A pose for all but `failed`, which is an answer, too; `coarse` is good to 0.5 m."""
 
     model_config = example(_ANSWER)
 
