@@ -75,7 +75,8 @@ def move_within(connection: Connection, wanted: Move, token: str) -> int:
         return done  # a commit whose answer was lost is run again
     for one in wanted.recordings:
         hold(connection, one)
-    rows = _present(connection, wanted.before)
+    rows = _present(connection, {**wanted.relied_on, **wanted.before})
+    _hold_poses(connection, rows)
     for one in wanted.recordings:
         _check_recording(connection, one, wanted, rows)
         if one.map_id != wanted.map_id:
@@ -137,6 +138,23 @@ def _present(connection: Connection, before: Mapping[int, FloatArray]) -> dict[i
         if pose is None or np.abs(pose - before[key]).max() > SAME:
             raise DatabaseError(f"keyframe {key} was deleted or moved meanwhile, nothing is changed: run it again")
     return found
+
+
+def _hold_poses(connection: Connection, rows: Mapping[int, Any]) -> None:
+    """Keeps others from moving keyframes, read as `rows`, until this is done. Raises DatabaseError where one did since.
+
+    What a transaction reads may be older than what others have committed meanwhile; what it updates is not. So each is
+    updated to what it is, if it is where it was.
+    """
+    k = keyframes.c
+    near = [k[name].between(bindparam(f"low_{name}"), bindparam(f"high_{name}")) for name in POSE_COLUMNS]
+    held = update(keyframes).where(k.id == bindparam("of_keyframe"), *near).values(frame_index=k.frame_index)
+    for key in sorted(rows):
+        numbers = {name: float(getattr(rows[key], name)) for name in POSE_COLUMNS}
+        low = {f"low_{name}": value - SAME for name, value in numbers.items()}
+        high = {f"high_{name}": value + SAME for name, value in numbers.items()}
+        if connection.execute(held, {"of_keyframe": key, **low, **high}).rowcount != 1:
+            raise DatabaseError(f"keyframe {key} was deleted or moved meanwhile, nothing is changed: run it again")
 
 
 def _check_recording(connection: Connection, one: MovedRecording, wanted: Move, rows: Mapping[int, Any]) -> None:

@@ -125,7 +125,8 @@ class Move:
     """Keyframes and recordings that move into the map `map_id` in one step.
 
     `before` and `after` ``[4, 4]`` by keyframe id: the poses that were read, and those to be. `covariances` ``[6, 6]``
-    replace those of the keyframes that have any here; others that move lose theirs.
+    replace those of the keyframes that have any here; others that move lose theirs. `relied_on` are poses of keyframes
+    that stay, and from which it was found out where the others go.
     """
 
     kind: OperationKind
@@ -135,4 +136,5 @@ class Move:
     recordings: tuple[MovedRecording, ...] = ()
     links: tuple[Link, ...] = ()
     covariances: Mapping[int, FloatArray] = field(default_factory=dict)
+    relied_on: Mapping[int, FloatArray] = field(default_factory=dict)
     parameters: Mapping[str, Any] = field(default_factory=dict)

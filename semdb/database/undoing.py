@@ -111,6 +111,8 @@ def _undo(connection: Connection, operation: PoseOperation, mine: list[bool]) ->
             _refuse_another_frame(connection, operation, map_id, source)
         poses |= _late(connection, operation, source, poses)
     mine_only = _of_recording(connection, operation, poses)
+    if operation.recording_id is not None and len(mine_only) < len(poses):
+        _refuse_the_map_before_others(connection, operation)
     put_poses(connection, mine_only, dict.fromkeys(mine_only, operation.map_id), map_id)
     others = {key: pose for key, pose in poses.items() if key not in mine_only}
     put_poses(connection, others, dict.fromkeys(others, operation.map_id), operation.map_id)
@@ -214,6 +216,23 @@ def _refuse_another_frame(
                 f"the map {operation.from_map!r} that the recording came from holds {other.name!r} by now, which has "
                 "another frame: delete that, or leave the recording where it is"
             )
+
+
+def _refuse_the_map_before_others(connection: Connection, operation: PoseOperation) -> None:
+    """Raises UsageError where the map's own keyframes moved with this one, and recordings that moved with both stay.
+
+    These lie where the map is now; without them it would go from under them.
+    """
+    c, r = pose_operations.c, recordings.c
+    token = operation.parameters.get("token")
+    query = select(r.name, c.parameters).join(recordings, r.id == c.recording_id)
+    there = query.where(c.map_id == operation.map_id, c.id != operation.id, c.undone_at.is_(None), r.map_id == c.map_id)
+    names = [name for name, text in connection.execute(there.order_by(c.id.desc())) if token and str(token) in text]
+    if names:
+        raise UsageError(
+            f"the map's own keyframes moved in the same step (--joint) as {', '.join(map(repr, names))}: take that "
+            "back first, this one last"
+        )
 
 
 def _recording_back(connection: Connection, operation: PoseOperation, map_id: int, source: RecordingPoses) -> None:

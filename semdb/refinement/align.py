@@ -361,6 +361,8 @@ def _move(
         "near_same": report.near_same,
         "joint": joint,
     }
+    links = tuple(_links(consensus, mine, theirs))
+    anchors = {} if joint else {link.first: theirs.poses[theirs.number[link.first]] for link in links}
     return Move(
         kind=OperationKind.ALIGN,
         map_id=target.id,
@@ -369,8 +371,9 @@ def _move(
         recordings=tuple(
             MovedRecording(one.recording_id, one.map_id, names[one.recording_id], motion) for one in recordings
         ),
-        links=tuple(_links(consensus, mine, theirs)),
+        links=links,
         covariances={key: value for key, value in spread.items() if np.isfinite(value).all() and value.any()},
+        relied_on=anchors,
         parameters=evidence,
     )
 

@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 
 from semdb.api import Answer, Database
-from semdb.errors import NotFoundError, UsageError
+from semdb.database.moving import move
+from semdb.database.pose_records import Move, OperationKind
+from semdb.errors import DatabaseError, NotFoundError, UsageError
 from semdb.geometry import invert_pose, pose_error, pose_from, so3_exp
 from semdb.recordings import open_recordings
 from semdb.recordings.base import Recording
@@ -168,6 +170,46 @@ def test_maps_are_merged_and_the_map_may_move_too(db: Database) -> None:
     assert np.median(errors(db, "room", "second", invert_pose(MOTION), before)[:, 0]) < 0.003
     db.undo_align(map="room")
     assert len(poses(db, "own", "second")) == 10
+
+
+def test_recordings_that_moved_with_the_map_are_taken_back_before_it(db: Database, rooms: dict[str, Path]) -> None:
+    db.ingest(part(rooms["room"], "third", slice(2, 40, 5)), map="own", stride=1, check=False)
+    there = {name: poses(db, "own", name) for name in ("second", "third")}
+    first = poses(db, "room", "first")
+    assert db.align(map="room", source_map="own", joint=True).convinced
+    moved = poses(db, "room", "first")
+    assert any(np.abs(moved[key] - first[key]).max() > 1e-6 for key in first)
+    carries, other = "second", "third"
+    with pytest.raises(UsageError, match=f"same step .--joint. as '{other}': take that back first"):
+        db.undo_align(carries)
+    assert all(np.array_equal(pose, moved[key]) for key, pose in poses(db, "room", "first").items())
+    db.undo_align(other)
+    db.undo_align(carries)
+    for name, before in {**there}.items():
+        assert all(np.allclose(pose, before[key]) for key, pose in poses(db, "own", name).items())
+    assert all(np.allclose(pose, first[key]) for key, pose in poses(db, "room", "first").items())
+
+
+def test_a_map_that_is_refined_while_it_is_aligned_with_is_noticed(
+    open_db: Opening, rooms: dict[str, Path]
+) -> None:
+    """Between looking and moving another process moves the map's keyframes: nothing of the alignment is written."""
+    db = open_db()
+    fill(db, rooms)
+    before = poses(db, "own", "second")
+    store = db._store()
+    kept = {one.id: one.world_from_camera for one in db.keyframes("room")}
+    shift = pose_from(np.eye(3), [0.2, 0.0, 0.0])
+    map_id = next(info.id for info in store.maps() if info.name == "room")
+
+    def refined(what: str, done: int, total: int) -> None:
+        if done == total:
+            move(store.engine, Move(OperationKind.REFINE, map_id, kept, {key: shift @ p for key, p in kept.items()}))
+
+    with pytest.raises(DatabaseError, match="was deleted or moved meanwhile, nothing is changed: run it again"):
+        db.align("second", map="room", progress=refined)
+    assert all(np.array_equal(pose, before[key]) for key, pose in poses(db, "own", "second").items())
+    assert db.align("second", map="room").convinced
 
 
 def test_an_estimated_map_bends_more_than_a_recorded_one(db: Database, tmp_path: Path) -> None:
