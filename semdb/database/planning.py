@@ -13,7 +13,7 @@ from semdb.database import checked, retry
 from semdb.database.ids import SharedIds, check_name, new_id
 from semdb.database.links import write_planned_links
 from semdb.database.pose_records import PoseSource
-from semdb.database.pose_sources import insert_poses, poses_of
+from semdb.database.pose_sources import insert_links, insert_poses, poses_of
 from semdb.database.records import (
     FailedItem,
     ItemState,
@@ -285,6 +285,9 @@ def _extend(connection: Connection, recording_id: int, plan: RecordingPlan, ther
     item = {"recording_id": recording_id, "state": ItemState.PENDING.value, "attempts": 0}
     added = sorted(set(plan.frame_indexes) - there)
     connection.execute(insert(ingest_items), [{**item, "frame_index": index} for index in added])
+    if plan.poses is not None:
+        new = set(added)
+        insert_links(connection, recording_id, [one for one in plan.poses.links if {one.first, one.second} & new])
 
 
 def _few(indexes: Sequence[int]) -> str:

@@ -5,7 +5,7 @@ What is stored late of a recording that was moved into another map goes through 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,7 @@ from sqlalchemy import Connection, Engine, and_, insert, select
 from semdb.database import checked, retry
 from semdb.database.keyframe_rows import pose_columns, pose_of
 from semdb.database.links import MOST_MATRIX, link_row, matrix_blob, matrix_of
-from semdb.database.pose_records import PlannedPoses, PoseSource, RecordingPoses, World
+from semdb.database.pose_records import Link, PlannedPoses, PoseSource, RecordingPoses, World
 from semdb.database.tables import POSE_COLUMNS, maps, planned_links, planned_poses, pose_sources, recordings
 from semdb.errors import UsageError
 from semdb.types import FloatArray
@@ -44,7 +44,14 @@ def insert_poses(connection: Connection, recording_id: int, map_id: int, planned
         }
         for index, pose in planned.poses.items()
     ]
-    links = [
+    for start in range(0, len(rows), ROWS):
+        connection.execute(insert(planned_poses), rows[start : start + ROWS])
+    insert_links(connection, recording_id, planned.links)
+
+
+def insert_links(connection: Connection, recording_id: int, links: Sequence[Link]) -> None:
+    """Writes links between planned frames, which are those of their keyframes once these are stored."""
+    rows = [
         {
             "recording_id": recording_id,
             "frame_index": link.first,
@@ -52,11 +59,10 @@ def insert_poses(connection: Connection, recording_id: int, map_id: int, planned
             "kind": link.kind.value,
             **link_row(link),
         }
-        for link in planned.links
+        for link in links
     ]
-    for table, values in ((planned_poses, rows), (planned_links, links)):
-        for start in range(0, len(values), ROWS):
-            connection.execute(insert(table), values[start : start + ROWS])
+    for start in range(0, len(rows), ROWS):
+        connection.execute(insert(planned_links), rows[start : start + ROWS])
 
 
 def _covariance(planned: PlannedPoses, index: int) -> bytes | None:

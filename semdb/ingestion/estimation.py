@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from semdb.database.pose_records import Link, LinkKind, LinkState, PlannedPoses, PoseSource
 from semdb.database.pose_sources import load_planned_poses, recording_poses
 from semdb.database.store import Store
@@ -17,6 +19,8 @@ from semdb.recordings.base import FrameEntry, Recording
 from semdb.trajectory.carried import carried_edges
 from semdb.trajectory.odometry import FrameState
 from semdb.trajectory.recording import RecordedTrajectory, find_recorded
+from semdb.trajectory.refining import DRIFT
+from semdb.trajectory.sessions import chain_links, step_covariances
 from semdb.types import FloatArray
 
 AUTO, RECORDED, ESTIMATED = "auto", "recorded", "estimated"
@@ -37,7 +41,7 @@ class Posed:
     def planned(self, entries: Sequence[FrameEntry]) -> PlannedPoses | None:
         """What a plan of the keyframes `entries` brings; None for recorded poses."""
         if self.found is None:
-            return None if self.stored is None else PlannedPoses(upright=False, poses=self.stored)
+            return None if self.stored is None else _grown(self.stored, entries)
         trajectory, frames = self.found.trajectory, self.found.entries
         place = {entry.index: position for position, entry in enumerate(frames)}
         chosen = [place[entry.index] for entry in entries]
@@ -63,6 +67,21 @@ class Posed:
             covariances={key: one.covariance for key, one in used.items() if one.covariance is not None},
             links=tuple(links),
         )
+
+
+def _grown(stored: Mapping[int, FloatArray], entries: Sequence[FrameEntry]) -> PlannedPoses:
+    """What a stored plan brings that may have more keyframes now: steps from each of `entries` to the next.
+
+    What was seen between these is not known any more, so they are as sure as odometry is on its way.
+    """
+    known = sorted(entry.index for entry in entries if entry.index in stored)
+    poses = np.array([stored[index] for index in known]).reshape(-1, 4, 4)
+    steps = chain_links(poses, step_covariances(poses, DRIFT))
+    links = [
+        Link(known[n], known[n + 1], LinkKind.ODOMETRY, relative, information, 0, LinkState.ACCEPTED, "", PROVENANCE)
+        for n, (relative, information) in enumerate(zip(steps.first_from_second, steps.information, strict=True))
+    ]
+    return PlannedPoses(upright=False, poses=stored, links=tuple(links))
 
 
 def check_poses(poses: str) -> None:

@@ -190,9 +190,7 @@ def test_recordings_that_moved_with_the_map_are_taken_back_before_it(db: Databas
     assert all(np.allclose(pose, first[key]) for key, pose in poses(db, "room", "first").items())
 
 
-def test_a_map_that_is_refined_while_it_is_aligned_with_is_noticed(
-    open_db: Opening, rooms: dict[str, Path]
-) -> None:
+def test_a_map_that_is_refined_while_it_is_aligned_with_is_noticed(open_db: Opening, rooms: dict[str, Path]) -> None:
     """Between looking and moving another process moves the map's keyframes: nothing of the alignment is written."""
     db = open_db()
     fill(db, rooms)

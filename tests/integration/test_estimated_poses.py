@@ -74,6 +74,10 @@ def test_a_map_without_poses_on_every_server(open_db: Opening, walk: tuple[Path,
     assert (more.already_stored, more.stored) == (6, 6)
     assert not any("are estimated from" in line for line in said)
     assert off(db, "walk", truth) < 0.01
+    frame = {one.id: one.frame_index for one in db.keyframes("walk")}
+    steps = [(frame[one.first], frame[one.second]) for one in list_links(store.engine) if one.kind is LinkKind.ODOMETRY]
+    assert sorted(steps) == sorted([*pairwise(range(0, 24, 4)), *pairwise(range(0, 24, 2))])
+    assert all(abs(link.off_m) < 1e-6 for link in db.loops("walk", odometry=True) if not link.inliers)
 
 
 def test_workers_take_poses_from_the_plan(open_file: Opening, walk: tuple[Path, FloatArray], tmp_path: Path) -> None:
