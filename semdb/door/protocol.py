@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any, Protocol, Self, TypeAlias, overload
 if TYPE_CHECKING:
     from datetime import datetime
 
+    from semdb.database.pose_records import PoseOperation
     from semdb.database.records import Deleted, MapInfo, RecordingStatus
     from semdb.door.found import Found
+    from semdb.door.links import KeyframeLink
     from semdb.door.tracked import Tracked
     from semdb.door.values import Answer, Keyframe, Rows
     from semdb.ingestion.run import IngestSummary
@@ -17,6 +19,7 @@ if TYPE_CHECKING:
     from semdb.recordings.arrays import CameraLike
     from semdb.recordings.base import Recording
     from semdb.recordings.options import ReadOptions
+    from semdb.refinement.align import AlignReport
     from semdb.refinement.run import StepResult
     from semdb.trajectory.recording import RecordedTrajectory
     from semdb.types import FloatArray, Frame, ModelInfo
@@ -77,6 +80,8 @@ class SemanticDatabase(Protocol):
         after: int = 0,
         limit: int | None = None,
     ) -> list[Keyframe]: ...
+
+    def loops(self, map: str | None = None, *, odometry: bool = False) -> list[KeyframeLink]: ...
 
     def find(
         self,
@@ -152,6 +157,20 @@ class SemanticDatabase(Protocol):
         depth_scale: float | None = None,
         progress: Callable[[str, int, int], None] | None = None,
     ) -> RecordedTrajectory: ...
+
+    def align(
+        self,
+        recording: str | None = None,
+        *,
+        map: str,
+        source_map: str | None = None,
+        name: str | None = None,
+        joint: bool = False,
+        dry_run: bool = False,
+        progress: Callable[[str, int, int], None] | None = None,
+    ) -> AlignReport: ...
+
+    def undo_align(self, recording: str | None = None, *, map: str | None = None) -> PoseOperation: ...
 
     def refine(
         self,
