@@ -45,6 +45,7 @@ _UNFIT = {1048, 1118, 1153, 1264, 1265, 1292, 1366, 1367, 1406}
 # Nothing listens, no such host, access denied, no such schema: trying again does not help.
 _UNREACHABLE = {2002, 2003, 2005}
 _LOST = {2006, 2013, 4031}
+LONGEST_REASON = 300  # characters of what a driver says
 _DENIED = {1044, 1045, 1049, 1698, 1142, 1227}
 _READ_ONLY = {1290, 1792, 1836}  # the server, the transactions that it begins, the schema
 _LARGE_PACKET = 1153
@@ -174,7 +175,8 @@ def explain(
     heals = heals or is_left(code, reason)
     unfit = isinstance(error, DataError) or code in _UNFIT or name in ("SQLITE_TOOBIG", "SQLITE_MISMATCH")
     kind = DatabaseUnavailableError if heals else UnstorableError if unfit else DatabaseError
-    return kind(f"the database {safe_url(engine.url)} {advice} ({reason})")
+    short = reason if len(reason) <= LONGEST_REASON else f"{reason[:LONGEST_REASON]}..."  # it may quote what was given
+    return kind(f"the database {safe_url(engine.url)} {advice} ({short})")
 
 
 def _of_tls(engine: Engine, code: int | None, reason: str, setting: str) -> str | None:

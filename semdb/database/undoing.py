@@ -61,15 +61,23 @@ def _operation(row: Any) -> PoseOperation:
     return PoseOperation(
         id=int(row.id),
         kind=checked.choice(row.kind, f"pose_operations.kind {where}", OperationKind),
-        map_id=int(row.map_id),
-        recording_id=None if row.recording_id is None else int(row.recording_id),
-        from_map_id=None if row.from_map_id is None else int(row.from_map_id),
-        from_map=row.from_map,
-        from_name=row.from_name,
+        map_id=checked.integer(row.map_id, f"pose_operations.map_id {where}"),
+        recording_id=_id(row.recording_id, f"pose_operations.recording_id {where}"),
+        from_map_id=_id(row.from_map_id, f"pose_operations.from_map_id {where}"),
+        from_map=_name(row.from_map, f"pose_operations.from_map {where}"),
+        from_name=_name(row.from_name, f"pose_operations.from_name {where}"),
         parameters=checked.mapping(row.parameters, f"pose_operations.parameters {where}"),
         created_at=checked.moment(row.created_at, f"pose_operations.created_at {where}"),
         undone_at=None if undone is None else checked.moment(undone, f"pose_operations.undone_at {where}"),
     )
+
+
+def _id(value: object, where: str) -> int | None:
+    return None if value is None else checked.integer(value, where)
+
+
+def _name(value: object, where: str) -> str | None:
+    return None if value is None else checked.text(value, where)
 
 
 def undo(engine: Engine, operation: PoseOperation) -> int:

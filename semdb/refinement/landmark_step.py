@@ -22,6 +22,8 @@ from semdb.database.landmark_records import (
     LandmarkVisit,
 )
 from semdb.database.left_out import telling
+from semdb.database.pose_records import World
+from semdb.database.pose_sources import recording_poses
 from semdb.database.store import Store
 from semdb.errors import CodecError, FrameError
 from semdb.landmarks.options import LandmarkOptions
@@ -58,7 +60,8 @@ class LandmarkStep:
         from semdb.threads import cores, each
 
         gravity = landmark_rows.load_gravity(store.engine, map_id)
-        up = np.array(gravity.up) if gravity is not None and gravity.given else None
+        told = gravity is not None and gravity.given
+        up = np.array(gravity.up) if gravity is not None and told else _up_of_poses(store, map_id)
         placed, names = placed_objects(store.iter_objects(map_id, None, store.left_out))
         confusion = _confusion(placed, names)
         total = 2 * max(store.keyframe_count(map_id), 1)
@@ -109,7 +112,7 @@ class LandmarkStep:
         wide = np.zeros((len(classes), len(classes)))
         wide[: len(names), : len(names)] = confusion
         found_all = find_landmarks(seen, len(classes), wide, up, self.options, show)
-        return _stored(found_all, rows, classes, list(recordings))
+        return _stored(found_all, rows, classes, list(recordings), told=told)
 
     def write(self, connection: Connection, map_id: int, result: LandmarkSet) -> int:
         from semdb.landmarks.identity import keep_ids
@@ -164,8 +167,15 @@ def _visit(visit: Visit, recordings: Sequence[str]) -> LandmarkVisit:
     return LandmarkVisit(recordings[visit.recording], str(visit.presence), *counts, centre, size)
 
 
+def _up_of_poses(store: Store, map_id: int) -> FloatArray | None:
+    """Up of a map all of whose poses were estimated and turned upright: z. None of others."""
+    sources = [recording_poses(store.engine, one.recording_id) for one in store.status(map_id)]
+    upright = [one.world is World.FIRST_KEYFRAME and one.upright is True for one in sources]
+    return np.array([0.0, 0.0, 1.0]) if upright and all(upright) else None
+
+
 def _stored(
-    found: Any, rows: Sequence[KeyframeDepth], classes: Sequence[str], recordings: Sequence[str]
+    found: Any, rows: Sequence[KeyframeDepth], classes: Sequence[str], recordings: Sequence[str], *, told: bool
 ) -> LandmarkSet:
     from semdb.landmarks.boxes import upright_axes
     from semdb.landmarks.relations import find_relations
@@ -216,7 +226,7 @@ def _stored(
         found.gravity.up_certainty,
         found.gravity.floor,
         found.gravity.floor_certainty,
-        found.gravity.given,
+        told,
     )
     relations = tuple(LandmarkRelation(r.one, str(r.kind), r.other, r.score) for r in related)
     return LandmarkSet(tuple(stored), relations, gravity)

@@ -167,6 +167,18 @@ def test_up_that_somebody_knows_is_kept(store: Store) -> None:
     assert told.up == (0.0, 1.0, 0.0)
     assert told.given
     give_up(store.engine, info.id, None)
+    with store.engine.begin() as connection:  # as if poses had been estimated, and turned upright
+        upright = "pose_source = 'estimated', world = 'first_keyframe', upright = 1"
+        connection.execute(text(f"UPDATE pose_sources SET {upright}"))
+    refine(store, info, force=True)
+    known = load_gravity(store.engine, info.id)
+    assert known is not None
+    assert known.up == (0.0, 0.0, 1.0)
+    assert not known.given
+    with store.engine.begin() as connection:
+        connection.execute(
+            text("UPDATE pose_sources SET world = 'recording', pose_source = 'recorded'")
+        )
     refine(store, info, force=True)
     assert load_gravity(store.engine, info.id) == estimated
 
