@@ -136,5 +136,5 @@ class Move:
     recordings: tuple[MovedRecording, ...] = ()
     links: tuple[Link, ...] = ()
     covariances: Mapping[int, FloatArray] = field(default_factory=dict)
-    relied_on: Mapping[int, FloatArray] = field(default_factory=dict)
     parameters: Mapping[str, Any] = field(default_factory=dict)
+    relied_on: Mapping[int, FloatArray] = field(default_factory=dict)

@@ -56,7 +56,7 @@ class SessionOptions:
     near_view: float = 0.5
     least_near: int = 4
     least_share: float = 0.5
-    recorded: StepNoise = StepNoise(0.0005, 0.003, 0.0005, 0.003)
+    recorded: StepNoise = StepNoise(0.0005, 0.003, 0.0002, 0.001)  # turns are what localizations know least
     drift: StepNoise = StepNoise(0.003, 0.02, 0.003, 0.02)
     claim_growth: float = 2.0  # of standard deviations of localizations, in the pose graph
     claim_m: float = 0.004  # which are believed to be no surer than that
