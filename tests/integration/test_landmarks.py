@@ -176,9 +176,7 @@ def test_up_that_somebody_knows_is_kept(store: Store) -> None:
     assert known.up == (0.0, 0.0, 1.0)
     assert not known.given
     with store.engine.begin() as connection:
-        connection.execute(
-            text("UPDATE pose_sources SET world = 'recording', pose_source = 'recorded'")
-        )
+        connection.execute(text("UPDATE pose_sources SET world = 'recording', pose_source = 'recorded'"))
     refine(store, info, force=True)
     assert load_gravity(store.engine, info.id) == estimated
 
