@@ -21,6 +21,7 @@ LEAST_MOVED_M = 0.04  # a thing that both visits show has moved by at least this
 LEAST_THROUGH = 0.12  # and so much of its points is seen through from the other visit
 LEAST_KEYFRAMES = 2  # that show a thing which appeared or disappeared
 LEAST_MISSED = 2  # keyframes that look at the place of a flat thing and find none
+GLIMPSED = 0.2  # of the points that are seen through where most are hidden
 LEAST_SCORE = 0.35  # of a pair
 CARRIED_M = 4.0  # a thing that stands so far away is half as likely the same one
 SIZE_RATIO = 2.5  # of the sides of two boxes: where they differ so, they are half as alike
@@ -123,8 +124,10 @@ def _only(shows: SeenIn | None, other: SeenIn | None) -> bool:
         return False
     if other.presence is Presence.ABSENT:
         return True
-    # what lies flat is not seen through where it is gone: enough to call it moved, if it is found elsewhere
-    return other.presence is Presence.UNOBSERVED and other.missed >= LEAST_MISSED
+    # where half of it is hidden, or it lies flat and is never seen through: enough if it is found elsewhere, and for
+    # nothing else
+    glimpsed = other.seen_through >= max(GLIMPSED * other.points, 2 * other.seen, 1)
+    return other.presence is Presence.UNOBSERVED and (glimpsed or other.missed >= LEAST_MISSED)
 
 
 def _gone(shows: SeenIn | None, other: SeenIn | None) -> bool:

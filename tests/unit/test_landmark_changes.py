@@ -83,6 +83,10 @@ def test_flat_things_that_nobody_sees_through_move_but_are_never_gone() -> None:
     missed = seen(Presence.UNOBSERVED, points=100, seen=100, missed=3)
     assert told(cup(1, shown(0), missed)) == []
     assert told(cup(1, shown(0), missed), cup(2, missed, shown(0.5))) == [("moved", 1, 2)]
+    # of what is mostly hidden enough is seen through for that, too
+    glimpsed = seen(Presence.UNOBSERVED, points=100, seen=5, seen_through=25, occluded=60)
+    assert told(cup(1, shown(0), glimpsed)) == []
+    assert told(cup(1, shown(0), glimpsed), cup(2, EMPTY, shown(0.5))) == [("moved", 1, 2)]
     once = replace(missed, missed=1)
     assert told(cup(1, shown(0), once), cup(2, once, shown(0.5))) == []
 
