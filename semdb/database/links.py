@@ -27,6 +27,7 @@ from semdb.types import FloatArray
 
 CHUNK = 500
 MOST_MATRIX = 1024  # bytes of the blob of a 6x6 matrix
+LARGEST_ID = 2**63 - 1
 _LINK = (*POSE_COLUMNS, "information", "inliers", "state", "reason", "provenance")
 
 
@@ -123,8 +124,8 @@ def list_links(
 def _link(row: Any) -> Link:
     where = f"of the link of keyframes {row.keyframe_id} and {row.other_keyframe_id}"
     return Link(
-        first=int(row.keyframe_id),
-        second=int(row.other_keyframe_id),
+        first=checked.integer(row.keyframe_id, f"loop_closures.keyframe_id {where}", 1, LARGEST_ID),
+        second=checked.integer(row.other_keyframe_id, f"loop_closures.other_keyframe_id {where}", 1, LARGEST_ID),
         kind=checked.choice(row.kind, f"loop_closures.kind {where}", LinkKind),
         first_from_second=pose_of([getattr(row, name) for name in POSE_COLUMNS], where.removeprefix("of ")),
         information=matrix_of(row.information, f"loop_closures.information {where}"),

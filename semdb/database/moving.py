@@ -185,7 +185,7 @@ def _check_links(connection: Connection, wanted: Move) -> None:
 def _done_before(connection: Connection, map_id: int, token: str) -> int | None:
     c = pose_operations.c
     newest = select(c.id, c.parameters).where(c.map_id == map_id).order_by(c.id.desc()).limit(100)
-    done = [int(key) for key, text in connection.execute(newest) if token in text]
+    done = [int(key) for key, text in connection.execute(newest) if token in str(text)]
     return min(done, default=None)
 
 

@@ -235,7 +235,8 @@ def _refuse_the_map_before_others(connection: Connection, operation: PoseOperati
     token = operation.parameters.get("token")
     query = select(r.name, c.parameters).join(recordings, r.id == c.recording_id)
     there = query.where(c.map_id == operation.map_id, c.id != operation.id, c.undone_at.is_(None), r.map_id == c.map_id)
-    names = [name for name, text in connection.execute(there.order_by(c.id.desc())) if token and str(token) in text]
+    moved = connection.execute(there.order_by(c.id.desc()))
+    names = [name for name, text in moved if token and str(token) in str(text)]
     if names:
         raise UsageError(
             f"the map's own keyframes moved in the same step (--joint) as {', '.join(map(repr, names))}: take that "
