@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# The servers that the tests run on loopback: MariaDB with Galera and Redis from the distribution, and a MySQL in a folder
-# of its own (install-mysql.sh); zsh, to press TAB in it. Tests on other servers name them in SEMDB_TEST_MARIADB_URL and
+# The servers that the tests run on loopback: MariaDB with Galera, Redis and nginx from the distribution, and a MySQL in a
+# folder of its own (install-mysql.sh); zsh, to press TAB in it. Tests on other servers name them in SEMDB_TEST_MARIADB_URL and
 # SEMDB_TEST_MYSQL_URL; those that kill servers, and those of a cluster, need them here.
 set -euo pipefail
 PATH=$PATH:/usr/sbin:/usr/local/sbin
@@ -12,6 +12,7 @@ command -v mariadbd >/dev/null || packages+=(mariadb-server)
 command -v rsync >/dev/null || packages+=(rsync)
 command -v redis-server >/dev/null || packages+=(redis-server)
 command -v zsh >/dev/null || packages+=(zsh)
+command -v nginx >/dev/null || packages+=(nginx-light)
 
 if [ ${#packages[@]} -gt 0 ] && ! "$here/apt-install.sh" "${packages[@]}"; then
   if command -v mariadbd >/dev/null || [ -n "${SEMDB_TEST_MARIADB_URL:-}" ]; then

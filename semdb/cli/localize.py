@@ -24,6 +24,7 @@ from semdb.cli.options import (
 if TYPE_CHECKING:
     from semdb.api import Answer, Database
     from semdb.cli.localized import AnswerTable, Tally
+    from semdb.client import RemoteDatabase
     from semdb.errors import FrameError
     from semdb.recordings import ReadOptions
 
@@ -64,6 +65,16 @@ def command(
         Path | None,
         typer.Option("--trajectory", metavar="FILE", help="Write the poses of a recording in TUM's format."),
     ] = None,
+    server: Annotated[
+        str | None,
+        typer.Option(
+            "--server",
+            metavar="URL",
+            envvar="SEMDB_SERVER",
+            show_envvar=False,
+            help="Ask the service there (semdb serve) instead of a database; over SEMDB_SERVER.",
+        ),
+    ] = None,
     plot: Annotated[Path | None, typer.Option("--plot", metavar="DIR", help="Write a picture per image.")] = None,
     json: JsonFlag = False,
 ) -> None:
@@ -77,6 +88,8 @@ def command(
 
     groups = grouped(sources)
     check_options(groups, depth or [], query_depth, reading, trajectory)
+    if server is not None:
+        check_server(server, overrides, plot)
     if plot is not None:
         if plot.suffix.lower() in (".png", ".jpg", ".jpeg") and not plot.is_dir():
             raise UsageError(
@@ -84,8 +97,11 @@ def command(
             )
         plot.mkdir(parents=True, exist_ok=True)
     tally = Tally()
-    asked = Asked(map_name, tuple(depth or ()), like, camera, reading, every, query_depth, coarse, accepted(accept))
-    with open_database(overrides.settings()) as database:
+    asked = Asked(
+        map_name, tuple(depth or ()), like, camera, reading, every, query_depth, coarse, accepted(accept),
+        server is not None,
+    )  # fmt: skip
+    with open_server(server) if server is not None else open_database(overrides.settings()) as database:
         if trajectory is not None:
             check_one_world(database, map_name)
         with trajectory_file(trajectory) as poses, Output(plot, json) as output:
@@ -149,7 +165,30 @@ def check_options(
         raise UsageError("--trajectory is of one recording, or of the images of one folder: name one")
 
 
-def check_one_world(database: Database, map_name: str | None) -> None:
+def check_server(server: str, overrides: Overrides, plot: Path | None) -> None:
+    """Raises UsageError for options that are of a database, and not of a service."""
+    from dataclasses import fields
+
+    from semdb.errors import UsageError
+    from semdb.shown import for_terminal
+
+    where = f"with a service (--server or SEMDB_SERVER, {for_terminal(server)})"
+    for field in fields(overrides):
+        if getattr(overrides, field.name) is not None:
+            raise UsageError(f"--{field.name.replace('_', '-')} means nothing {where}: leave out one of them")
+    if plot is not None:
+        raise UsageError(f"--plot means nothing {where}: pictures are drawn from a database (--database-url)")
+
+
+def open_server(url: str) -> RemoteDatabase:
+    """The service that a command asks. Raises UsageError."""
+    from semdb.cli.progress import say
+    from semdb.client import connect
+
+    return connect(url, say=say)
+
+
+def check_one_world(database: Database | RemoteDatabase, map_name: str | None) -> None:
     """A trajectory is in one frame. Raises UsageError where several maps would answer."""
     from semdb.errors import UsageError
 
@@ -171,8 +210,9 @@ class Asked:
     query_depth: bool
     coarse: str
     accept: tuple[float, float] | None
+    remote: bool = False
 
-    def answers(self, database: Database, group: Group, tally: Tally) -> Iterator[Answer]:
+    def answers(self, database: Database | RemoteDatabase, group: Group, tally: Tally) -> Iterator[Answer]:
         """The answers one by one, with progress where nobody sees them; what cannot be read is said and counted."""
         from semdb.cli.localized import prints_to_people
         from semdb.cli.progress import Progress, say
@@ -191,9 +231,11 @@ class Asked:
                 yield answer
 
     def _ask(
-        self, database: Database, group: Group, unreadable: Callable[[FrameError], None]
+        self, database: Database | RemoteDatabase, group: Group, unreadable: Callable[[FrameError], None]
     ) -> tuple[int, Iterator[Answer]]:
-        """How many there are, and the answers."""
+        """How many there are, and the answers. A service has its own coarse step; the answers are the same."""
+        own: dict[str, Any] = {"masks": False} if self.remote else {"coarse": self.coarse}
+        own["accept"] = self.accept
         if group.recording is not None:
             opened = database.open_recording(
                 group.recording, map=self.map, camera=self.camera, reading=self.reading, like=self.like
@@ -203,9 +245,8 @@ class Asked:
                 map=self.map,
                 every=self.every,
                 query_depth=self.query_depth,
-                coarse=self.coarse,
-                accept=self.accept,
                 unreadable=unreadable,
+                **own,
             )
             return len(opened.entries[:: self.every]), answers
         images = group.images[:: self.every]
@@ -216,9 +257,8 @@ class Asked:
             depth_scale=self.reading.depth_scale,
             camera=self.camera,
             like=self.like,
-            coarse=self.coarse,
-            accept=self.accept,
             unreadable=unreadable,
+            **own,
         )
         return len(images), answers
 

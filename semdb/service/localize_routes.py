@@ -29,6 +29,10 @@ CameraText = Annotated[
 Like = Annotated[str | None, Form(max_length=255, description="a recording whose camera and depth scale it has")]
 DepthScale = Annotated[float | None, Form(description="units per metre of the depth image")]
 Masks = Annotated[bool, Form(description="with the pixels of each object")]
+AcceptM = Annotated[
+    float | None, Form(gt=0, le=1000, description="with accept_deg: poses that differ by no more are one, metres")
+]
+AcceptDeg = Annotated[float | None, Form(gt=0, le=180, description="with accept_m, degrees")]
 Log = Annotated[bool, Form(description="into the log of queries")]
 Instances = Annotated[
     UploadFile | None, File(description="a PNG of labels: object masks of the image, for maps of the detector recorded")
@@ -54,6 +58,7 @@ class Query:
     categories: str | None = None
     frame_index: int | None = None
     timestamp_ns: int | None = None
+    accept: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,11 +80,21 @@ def query_of(
     categories: Categories = None,
     frame_index: FrameIndex = None,
     timestamp_ns: Timestamp = None,
+    accept_m: AcceptM = None,
+    accept_deg: AcceptDeg = None,
 ) -> Query:
     """What the fields of a form ask for, in the map of the address, or those that the token is for."""
     asked = request.path_params.get("map", access_of(request).map)
-    more = (categories or None, frame_index, timestamp_ns)
+    more = (categories or None, frame_index, timestamp_ns, _accept(accept_m, accept_deg))
     return Query(asked, camera or None, like or None, depth_scale, masks, log, *more)
+
+
+def _accept(metres: float | None, degrees: float | None) -> tuple[float, float] | None:
+    if metres is None and degrees is None:
+        return None
+    if metres is None or degrees is None:
+        raise Problem(422, "accept_m and accept_deg go together")
+    return metres, degrees
 
 
 async def files_of(image: Image, depth: Depth = None, instances: Instances = None) -> Given:
@@ -169,7 +184,7 @@ def work_of(service: Service, access: Access, query: Query, given: Given, name: 
                 depth_scale=query.depth_scale,
                 name=name,
             )
-            return database.localize(frame, map=query.map, name=name, log=query.log)
+            return database.localize(frame, map=query.map, name=name, accept=query.accept, log=query.log)
         return database.localize(
             given.image,
             map=query.map,
@@ -178,6 +193,7 @@ def work_of(service: Service, access: Access, query: Query, given: Given, name: 
             depth_scale=query.depth_scale,
             like=query.like,
             name=name,
+            accept=query.accept,
             log=query.log,
         )
 

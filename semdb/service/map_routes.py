@@ -177,9 +177,11 @@ async def find(
     where, origin = map if map is not None else access.map, place(x, y, z)
     found = await read(
         request,
-        lambda db: db.find(
-            what, near=near, on=on, not_near=not_near, map=where, seen_after=seen_after, origin=origin, limit=limit
-        ).as_dict(),
+        lambda db: values.found_dict(
+            db.find(
+                what, near=near, on=on, not_near=not_near, map=where, seen_after=seen_after, origin=origin, limit=limit
+            )
+        ),
     )
     return as_json(found)
 

@@ -44,6 +44,7 @@ TITLES = {
     503: "Not available",
     507: "No room",
 }
+_CANNOT_BE_USED: dict[type[SemdbError], str] = {FrameError: "frame", RecordingError: "recording", UsageError: "usage"}
 _IN_DATABASE = re.compile(r" (?:in|of) \w+(?:\+\w+)?://\S*")
 _URL = re.compile(r"\w+(?:\+\w+)?://[^\s'\"]*")
 _PATH = re.compile(r"(?<![\w.>])(?:~|\.{1,2})?/(?:[^\s/:;,'\"()]+/)*[^\s/:;,'\"()]+/?")
@@ -99,8 +100,9 @@ def problem_of(error: SemdbError) -> Problem:
     """What a client is told of an error of the library."""
     if isinstance(error, NotFoundError):
         return Problem(404, scrubbed(error))
-    if isinstance(error, FrameError | UsageError | RecordingError):
-        return Problem(422, scrubbed(error))
+    for cause, kind in _CANNOT_BE_USED.items():
+        if isinstance(error, cause):
+            return Problem(422, scrubbed(error), kind=kind)
     if isinstance(error, ProvenanceError):
         return Problem(409, scrubbed(error), kind="other-models")
     if isinstance(error, ModelError):

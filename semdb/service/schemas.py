@@ -221,6 +221,13 @@ class CandidateModel(Model):
     inliers: int
 
 
+class OtherPose(Model):
+    """A pose elsewhere that the image fits too, with so many keypoints."""
+
+    world_from_camera: Matrix
+    inliers: int
+
+
 class Answer(Model):
     """Where an image was taken. A pose for all but `failed`, which is an answer, too; `coarse` is good to 0.5 m."""
 
@@ -232,6 +239,7 @@ class Answer(Model):
     pose: Pose | None
     world_from_camera: Matrix | None
     covariance: Matrix | None = Field(description="6x6: translation (m), then rotation (rad)")
+    others: list[OtherPose] = Field(default_factory=list, description="that stand against this one, best first")
     confidence: float | None
     inliers: int
     stage: str

@@ -64,7 +64,7 @@ def _ask(service: Service, sql: str, private: bool) -> tuple[list[str], list[lis
     except UsageError as error:
         if "SEMDB_READER_URL" in str(error):
             raise Problem(501, "the service has no account that may only read: SEMDB_READER_URL") from error
-        raise Problem(422, scrubbed(error), kind="statement") from error
+        raise Problem(422, scrubbed(error), kind="usage") from error
     except DatabaseError as error:
         if "SEMDB_READER_URL" in str(error):
             raise Problem(501, "the account that may only read may do more, or cannot be used") from error

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from semdb.database.landmark_reading import StoredLandmark, StoredRelation
     from semdb.database.query_log import LoggedQuery
     from semdb.database.records import MapInfo, RecordingStatus
+    from semdb.door.found import Found
     from semdb.door.links import KeyframeLink
     from semdb.door.values import Answer, Keyframe, SeenObject
 
@@ -111,6 +112,9 @@ def answer_dict(answer: Answer, *, masks: bool = False, notes: Sequence[str] = (
     return {
         **answer.as_dict(),
         "world_from_camera": None if pose is None else pose.tolist(),
+        "others": [
+            {"world_from_camera": other.world_from_camera.tolist(), "inliers": other.inliers} for other in answer.others
+        ],
         "objects": [object_dict(thing, mask=masks) for thing in answer.objects],
         "notes": list(notes),
     }
@@ -155,6 +159,15 @@ def landmark_dict(found: StoredLandmark, map_name: str) -> dict[str, Any]:
             "timestamp_ns": found.last_seen_ns,
         },
     }
+
+
+def found_dict(found: Found) -> dict[str, Any]:
+    """What ``semdb find --json`` prints, with the poses of viewpoints as matrices, too."""
+    content = found.as_dict()
+    for shown, hit in zip(content["hits"], found.hits, strict=True):
+        if hit.viewpoint is not None:
+            shown["viewpoint"]["world_from_camera"] = hit.viewpoint.world_from_camera.tolist()
+    return content
 
 
 def relation_dict(found: StoredRelation) -> dict[str, Any]:

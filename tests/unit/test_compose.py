@@ -47,7 +47,7 @@ def test_the_specification_finds_a_misspelled_key(tmp_path: Path) -> None:
 
 def test_services_and_images(compose: dict[str, Any]) -> None:
     services = compose["services"]
-    assert set(services) == {"database", "migrate", "broker", "worker"}
+    assert set(services) == {"database", "migrate", "broker", "worker", "service"}
     assert services["database"]["image"] == "mysql:9.7"
     assert services["migrate"]["command"] == ["semdb", "init"]
     assert services["migrate"]["restart"] == "no"  # one shot
@@ -65,7 +65,7 @@ def test_dependencies_exist_and_can_be_met(compose: dict[str, Any]) -> None:
             else:
                 assert services[other]["restart"] == "no"
     assert services["worker"]["depends_on"]["migrate"]["condition"] == "service_completed_successfully"
-    assert all("healthcheck" in services[name] for name in ("database", "broker", "worker"))
+    assert all("healthcheck" in services[name] for name in ("database", "broker", "worker", "service"))
 
 
 def test_named_volumes_are_declared(compose: dict[str, Any]) -> None:
@@ -89,17 +89,19 @@ def test_no_password_is_in_the_file_and_every_one_is_required(compose: dict[str,
             if match:
                 assert re.fullmatch(r"\$\{[A-Z_]+:\?[^}]+\}", match[1]), f"{variable} has a password in the file"
                 secrets += 1
-    # root, owner, writer, reader; the broker's; and in the URLs of migrate (one) and worker (three)
-    assert secrets == 9
+    # root, owner, writer, reader; the broker's; and in the URLs of migrate (one), worker and service (three each)
+    assert secrets == 12
+    assert re.fullmatch(r"\$\{[A-Z_]+:\?[^}]+\}", compose["services"]["service"]["environment"]["SEMDB_SERVE_SECRET"])
 
 
 def test_each_service_has_the_account_that_it_needs(compose: dict[str, Any]) -> None:
     services = compose["services"]
     assert "://semdb_owner:" in services["migrate"]["environment"]["SEMDB_DATABASE_URL"]
-    worker = services["worker"]["environment"]
-    assert "://semdb_writer:" in worker["SEMDB_DATABASE_URL"]
-    assert "://semdb_reader:" in worker["SEMDB_READER_URL"]
-    assert all("ssl_mode=REQUIRED" in worker[name] for name in ("SEMDB_DATABASE_URL", "SEMDB_READER_URL"))
+    for name in ("worker", "service"):
+        given = services[name]["environment"]
+        assert "://semdb_writer:" in given["SEMDB_DATABASE_URL"]
+        assert "://semdb_reader:" in given["SEMDB_READER_URL"]
+        assert all("ssl_mode=REQUIRED" in given[url] for url in ("SEMDB_DATABASE_URL", "SEMDB_READER_URL"))
     # passwords on a command line are in the list of processes
     for service in services.values():
         for part in (*service.get("command", []), *service.get("healthcheck", {}).get("test", [])):
@@ -138,11 +140,22 @@ def test_the_script_of_the_accounts_grants_what_semdb_does(tmp_path: Path) -> No
     assert "letters and digits" in refused.stderr
 
 
+def test_the_service_is_reached_on_loopback_and_workers_see_its_uploads(compose: dict[str, Any]) -> None:
+    service, worker = compose["services"]["service"], compose["services"]["worker"]
+    assert [port.split(":")[0] for port in service["ports"]] == ["127.0.0.1"]
+    assert "uploads:/uploads" in service["volumes"]
+    assert "uploads:/uploads:ro" in worker["volumes"]
+    assert service["environment"]["SEMDB_SERVE_UPLOADS"] == "/uploads"
+    assert service["environment"]["SEMDB_RECORDING_ROOTS"].endswith("/recordings:/uploads}")
+
+
 def test_settings_that_services_get_exist(compose: dict[str, Any]) -> None:
+    from semdb.service.settings import ServeSettings
     from semdb.settings import Settings
 
     known = {f"SEMDB_{name.upper()}" for name in Settings.model_fields}
-    for name in ("migrate", "worker"):
+    known |= {f"SEMDB_SERVE_{name.upper()}" for name in ServeSettings.model_fields}
+    for name in ("migrate", "worker", "service"):
         assert set(compose["services"][name]["environment"]) <= known
     for name in ("database", "broker"):
         assert not set(compose["services"][name]["environment"]) & known
@@ -162,6 +175,7 @@ def test_the_dockerfile_copies_what_is_there_and_not_ignored() -> None:
 def docker_compose(*arguments: str) -> subprocess.CompletedProcess[str]:
     names = ("DB_ROOT", "OWNER", "WRITER", "READER", "BROKER")
     environment = {**{f"SEMDB_{name}_PASSWORD": "a" for name in names}, "PATH": os.environ["PATH"]}
+    environment["SEMDB_SERVE_SECRET"] = 32 * "a"
     command = ["docker", "compose", *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=False, env=environment, timeout=60)
 

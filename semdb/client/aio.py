@@ -1,0 +1,149 @@
+"""The same for asyncio: requests run in threads, so that the loop goes on."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any, Self, TypeVar
+
+from semdb.client.database import RemoteDatabase, connect
+
+if TYPE_CHECKING:
+    from semdb.database.records import Deleted, MapInfo, RecordingStatus
+    from semdb.door.changed import Changes
+    from semdb.door.found import Found
+    from semdb.door.links import KeyframeLink
+    from semdb.door.values import Answer, Keyframe, Rows
+    from semdb.ingestion.run import IngestSummary
+    from semdb.types import ModelInfo
+
+T = TypeVar("T")
+MOST_AT_ONCE = 32
+_END = object()
+
+
+class AsyncDatabase:
+    """The methods of `RemoteDatabase` as coroutines, which take what those take; at most 32 run at once.
+
+    A task that is cancelled does not wait any longer; what was asked goes on, and is not heard of. What a keyframe
+    reads when it is looked at blocks: `load` reads it before.
+    """
+
+    def __init__(self, database: RemoteDatabase) -> None:
+        self.database = database
+        self._pool = ThreadPoolExecutor(MOST_AT_ONCE, thread_name_prefix="semdb-client")
+
+    async def _run(self, work: Callable[..., T], *arguments: Any, **options: Any) -> T:
+        return await asyncio.get_running_loop().run_in_executor(self._pool, lambda: work(*arguments, **options))
+
+    async def _each(self, begin: Callable[[], Iterator[T]]) -> AsyncIterator[T]:
+        answers = await self._run(begin)
+        while (answer := await self._run(next, answers, _END)) is not _END:
+            yield answer
+
+    @property
+    def url(self) -> str:
+        """The address of the service."""
+        return self.database.url
+
+    async def close(self) -> None:
+        """Lets go of the connections."""
+        await self._run(self.database.close)
+        self._pool.shutdown(wait=False)
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    async def check(self) -> None:
+        """Asks for something now."""
+        await self._run(self.database.check)
+
+    async def maps(self) -> list[MapInfo]:
+        """As `RemoteDatabase.maps`."""
+        return await self._run(self.database.maps)
+
+    async def map(self, name: str) -> MapInfo:
+        """As `RemoteDatabase.map`."""
+        return await self._run(self.database.map, name)
+
+    async def models(self, map: str) -> tuple[ModelInfo, ...]:
+        """As `RemoteDatabase.models`."""
+        return await self._run(self.database.models, map)
+
+    async def recordings(self, map: str | None = None) -> list[RecordingStatus]:
+        """As `RemoteDatabase.recordings`."""
+        return await self._run(self.database.recordings, map)
+
+    async def recording(self, name: str, map: str | None = None) -> RecordingStatus:
+        """As `RemoteDatabase.recording`."""
+        return await self._run(self.database.recording, name, map)
+
+    async def keyframe(self, keyframe_id: int) -> Keyframe:
+        """As `RemoteDatabase.keyframe`."""
+        return await self._run(self.database.keyframe, keyframe_id)
+
+    async def keyframes(self, map: str | None = None, recording: str | None = None, **options: Any) -> list[Keyframe]:
+        """As `RemoteDatabase.keyframes`."""
+        return await self._run(self.database.keyframes, map, recording, **options)
+
+    async def load(self, keyframe: Keyframe, *what: str) -> Keyframe:
+        """The keyframe, with its ``image``, ``depth``, ``objects``, ``keypoints``, or all, read and kept."""
+        for name in what or ("image", "depth", "objects", "keypoints"):
+            await self._run(getattr, keyframe, name)
+        return keyframe
+
+    async def loops(self, map: str | None = None, *, odometry: bool = False) -> list[KeyframeLink]:
+        """As `RemoteDatabase.loops`."""
+        return await self._run(self.database.loops, map, odometry=odometry)
+
+    async def find(self, what: str, **options: Any) -> Found:
+        """As `RemoteDatabase.find`."""
+        return await self._run(self.database.find, what, **options)
+
+    async def changes(self, before: str, after: str, map: str | None = None) -> Changes:
+        """As `RemoteDatabase.changes`."""
+        return await self._run(self.database.changes, before, after, map)
+
+    async def sql(self, statement: str) -> Rows:
+        """As `RemoteDatabase.sql`: the rows are there."""
+        return await self._run(self.database.sql, statement)
+
+    async def tables(self) -> dict[str, tuple[str, ...]]:
+        """As `RemoteDatabase.tables`."""
+        return await self._run(self.database.tables)
+
+    async def localize(self, image: Any, **options: Any) -> Any:
+        """As `RemoteDatabase.localize`: an `Answer`, of a list of images a list of them."""
+        return await self._run(self.database.localize, image, **options)
+
+    def localize_each(self, images: Any, **options: Any) -> AsyncIterator[Answer]:
+        """As `RemoteDatabase.localize_each`, for ``async for``."""
+        return self._each(lambda: self.database.localize_each(images, **options))
+
+    def localize_recording(self, recording: Any, **options: Any) -> AsyncIterator[Answer]:
+        """As `RemoteDatabase.localize_recording`, for ``async for``."""
+        return self._each(lambda: self.database.localize_recording(recording, **options))
+
+    async def ingest(self, source: Any, **options: Any) -> list[IngestSummary]:
+        """As `RemoteDatabase.ingest`; `progress` is called in another thread."""
+        return await self._run(self.database.ingest, source, **options)
+
+    async def delete(
+        self,
+        *,
+        map: str | None = None,
+        recording: str | None = None,
+        keyframes: Iterable[int] | None = None,
+        **options: Any,
+    ) -> Deleted:
+        """As `RemoteDatabase.delete`."""
+        return await self._run(self.database.delete, map=map, recording=recording, keyframes=keyframes, **options)
+
+
+def connect_async(url: str, **options: Any) -> AsyncDatabase:
+    """See `semdb.connect_async`."""
+    return AsyncDatabase(connect(url, **options))
