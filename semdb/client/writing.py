@@ -20,11 +20,14 @@ from semdb.names import storable
 
 if TYPE_CHECKING:
     from semdb.client.images import ImageReader
+    from semdb.database.pose_records import PoseOperation
     from semdb.database.records import Deleted
-    from semdb.door.protocol import Source
+    from semdb.door.protocol import CameraTracker, Source
     from semdb.ingestion.run import IngestSummary
+    from semdb.localization.query_image import PathText
     from semdb.recordings.arrays import CameraLike
     from semdb.recordings.options import ReadOptions
+    from semdb.refinement.align import AlignReport
     from semdb.refinement.run import StepResult
     from semdb.trajectory.recording import RecordedTrajectory
     from semdb.types import Frame, ModelInfo
@@ -273,6 +276,35 @@ class Writing(Localizing):
     ) -> RecordedTrajectory:
         """Is for `semdb.open` only, which asks no database for it: raises UsageError."""
         self._not_here("trajectory")
+
+    def tracker(
+        self,
+        map: str | None = None,
+        *,
+        camera: CameraLike | None = None,
+        like: PathText | None = None,
+        depth_scale: float | None = None,
+    ) -> CameraTracker:
+        """Is for `semdb.open` only: raises UsageError."""
+        self._not_here("tracker")
+
+    def align(
+        self,
+        recording: str | None = None,
+        *,
+        map: str,
+        source_map: str | None = None,
+        name: str | None = None,
+        joint: bool = False,
+        dry_run: bool = False,
+        progress: Callable[[str, int, int], None] | None = None,
+    ) -> AlignReport:
+        """Is for `semdb.open` only: raises UsageError."""
+        self._not_here("align")
+
+    def undo_align(self, recording: str | None = None, *, map: str | None = None) -> PoseOperation:
+        """Is for `semdb.open` only: raises UsageError."""
+        self._not_here("undo_align")
 
     def _not_here(self, what: str) -> NoReturn:
         raise UsageError(f"{what} is for semdb.open only: the service at {self.url} does not offer it")
