@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator, Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
-from semdb.client.database import RemoteDatabase, connect
+from semdb.client.writing import Writing
 
 if TYPE_CHECKING:
     from semdb.database.records import Deleted, MapInfo, RecordingStatus
@@ -30,7 +30,7 @@ class AsyncDatabase:
     reads when it is looked at blocks: `load` reads it before.
     """
 
-    def __init__(self, database: RemoteDatabase) -> None:
+    def __init__(self, database: Writing) -> None:
         self.database = database
         self._pool = ThreadPoolExecutor(MOST_AT_ONCE, thread_name_prefix="semdb-client")
 
@@ -142,8 +142,3 @@ class AsyncDatabase:
     ) -> Deleted:
         """As `RemoteDatabase.delete`."""
         return await self._run(self.database.delete, map=map, recording=recording, keyframes=keyframes, **options)
-
-
-def connect_async(url: str, **options: Any) -> AsyncDatabase:
-    """See `semdb.connect_async`."""
-    return AsyncDatabase(connect(url, **options))

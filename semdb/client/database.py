@@ -19,10 +19,6 @@ class RemoteDatabase(Writing):
     Any number of threads may ask it at the same time. What it answers with are the values of `semdb.open`.
     """
 
-    def close(self) -> None:
-        """Lets go of the connections."""
-        self._transport.close()
-
     @property
     def aio(self) -> AsyncDatabase:
         """The same for asyncio."""
@@ -57,6 +53,11 @@ def connect(
     if transport.in_the_open:
         database._say(f"{transport.url}: the token is sent unencrypted; https:// keeps it from who is on the way")
     return database
+
+
+def connect_async(url: str, **options: Any) -> AsyncDatabase:
+    """See `semdb.connect_async`."""
+    return connect(url, **options).aio
 
 
 if TYPE_CHECKING:

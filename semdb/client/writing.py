@@ -42,6 +42,10 @@ FRAME_NS = 33_333_333  # between frames that bring no times
 class Writing(Localizing):
     """Ingests and deletes."""
 
+    def close(self) -> None:
+        """Lets go of the connections."""
+        self._transport.close()
+
     def ingest(
         self,
         source: Source,

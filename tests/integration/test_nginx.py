@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import shutil
 import subprocess
@@ -61,7 +62,8 @@ def proxied(folder: Path, ports: Sequence[int], certificate: tuple[Path, Path]) 
         text = text.replace(old, new)
     kinds = ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
     temporary = "\n".join(f"{kind}_temp_path {folder / kind};" for kind in kinds)
-    main = f"daemon off; pid {folder / 'pid'}; error_log {folder / 'errors'}; events {{}}\n"
+    user = "user root;\n" if os.geteuid() == 0 else ""  # its own account may not into folders of tests
+    main = f"{user}daemon off; pid {folder / 'pid'}; error_log {folder / 'errors'}; events {{}}\n"
     (folder / "main.conf").write_text(f"{main}http {{ access_log off;\n{temporary}\n{text}\n}}\n")
     command = [program, "-p", str(folder), "-e", str(folder / "errors"), "-c", str(folder / "main.conf")]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
