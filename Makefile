@@ -34,7 +34,7 @@ $(VENV)/.stamp-base: pyproject.toml $(LOCK) | $(BIN)/python
 
 $(VENV)/.stamp-dev: pyproject.toml $(LOCK) | $(BIN)/python
 	@echo "installing semdb with the torch (several GB), worker, serve and development extras into $(VENV)"
-	@$(PIP) install --constraint $(LOCK) --editable '.[torch,worker,serve,dev]'
+	@$(PIP) install --constraint $(LOCK) --editable '.[torch,worker,serve,client,dev]'
 	@touch $(VENV)/.stamp-base $(VENV)/.stamp-serve $@
 
 demo: $(VENV)/.stamp-base
