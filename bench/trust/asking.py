@@ -68,4 +68,4 @@ def _ask(
     description = describer.describe(picture.image, None, picture.camera, picture.instances)
     for asked in query.asked:
         found = localizers[asked.map_name].localize(description)
-        yield make_row(world_name, query, asked, half[asked.map_name], found)
+        yield make_row(world_name, query, asked, half[asked.map_name], found, ALL_POSES.verdict)

@@ -25,7 +25,11 @@ COUNTS = ("inliers", "first_inliers", "first_of_best", "rival", "supporters", "s
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One answer. Errors are None without a pose or a true pose; `nees` of all six, position and rotation."""
+    """One answer. Errors are None without a pose or a true pose; `nees` of all six, position and rotation.
+
+    `laid` is a verdict with its confidence and reason that the query's edges on those of the map gave: it is kept, for
+    it is not made of the evidence of keypoints alone.
+    """
 
     world: str
     name: str
@@ -41,6 +45,7 @@ class Row:
     milliseconds: float
     reason: str
     evidence: dict[str, float]
+    laid: tuple[str, float, str] | None = None
 
     @property
     def is_right(self) -> bool:
@@ -58,8 +63,8 @@ class Row:
         return self.is_localized and not self.is_right
 
 
-def make_row(world: str, query: Query, asked: Asked, half: str, found: Localization) -> Row:
-    """The row of an answer, not yet judged."""
+def make_row(world: str, query: Query, asked: Asked, half: str, found: Localization, asked_with: VerdictOptions) -> Row:
+    """The row of an answer of a localizer with the bounds `asked_with`, judged with those that are usual."""
     translation = rotation = nees = None
     truth = query.world_from_camera if asked.kind != NEGATIVE else None
     if truth is not None and found.world_from_camera is not None:
@@ -82,20 +87,25 @@ def make_row(world: str, query: Query, asked: Asked, half: str, found: Localizat
         reason="",
         evidence=dict(found.evidence),
     )
+    if judge(evidence_of(row), asked_with).reason != found.reason:
+        row = replace(row, laid=(str(found.verdict), found.confidence, found.reason))
     return judged(row)
 
 
 def evidence_of(row: Row) -> Evidence | None:
     """The evidence as the verdict takes it; None where no pose was found."""
-    if not row.evidence:
-        return None
     names = {field.name for field in fields(Evidence)}
+    if not names <= row.evidence.keys():
+        return None
     values = {n: int(v) if n in COUNTS else float(v) for n, v in row.evidence.items() if n in names}
     return Evidence(**values)  # type: ignore[arg-type]
 
 
 def judged(row: Row) -> Row:
-    """The row with the verdict and the confidence that its evidence has now."""
+    """The row with the verdict and the confidence that its evidence has now, or that edges gave."""
+    if row.laid is not None:
+        verdict, confidence, reason = row.laid
+        return replace(row, verdict=verdict, confidence=confidence, reason=reason)
     found = judge(evidence_of(row), VerdictOptions())
     return replace(row, verdict=str(found.verdict), confidence=found.confidence, reason=found.reason)
 
@@ -119,7 +129,7 @@ def save_rows(path: Path, rows: Iterable[Row]) -> None:
 def load_rows(path: Path) -> list[Row]:
     """The rows of a file of `save_rows`, judged anew."""
     return [
-        judged(Row(**{**row, "nees": tuple(row["nees"]) if row["nees"] else None}))
+        judged(Row(**{**row, **{name: tuple(row[name]) if row.get(name) else None for name in ("nees", "laid")}}))
         for row in json.loads(path.read_text())
     ]
 

@@ -166,7 +166,9 @@ def may_overrule(convinced: bool, evidence: Evidence, laid: LaidPose, options: L
     `evidence` is what keypoints say of that pose, `convinced` whether there were many. Where a place is there twice
     it does not: the other place has as many, though nothing may have been laid on it.
     """
-    own = evidence.first_of_best if convinced else laid.support  # once convinced, one keyframe elsewhere was asked
+    own = evidence.first_of_best  # like with like: once convinced, one keyframe elsewhere was asked
+    if not convinced:
+        own = min(own, laid.support)
     if evidence.rival > options.rival_alone * own:
         return False
     confidence = confidence_of(evidence)
