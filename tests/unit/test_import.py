@@ -47,10 +47,9 @@ def test_all_names_are_there() -> None:
     for name in semdb.__all__:
         assert getattr(semdb, name) is not None
     assert set(semdb.__all__) <= set(dir(semdb))
-    assert "connect" not in semdb.__all__  # comes with the service
     with pytest.raises(AttributeError, match="no attribute 'opne'"):
         _ = semdb.opne
 
 
 def test_every_lazy_name_is_public() -> None:
-    assert set(semdb._LAZY) | {"open"} == set(semdb.__all__)
+    assert set(semdb._LAZY) | {"open", "connect", "connect_async"} == set(semdb.__all__)
