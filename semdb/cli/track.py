@@ -58,7 +58,7 @@ def command(
     every: Annotated[int, typer.Option("--every", metavar="N", min=1, help="Every N-th frame.")] = 1,
     rate: Annotated[
         float | None,
-        typer.Option("--rate", metavar="HZ", help="Frames a second of a folder of images; default 30."),
+        typer.Option("--rate", metavar="HZ", min=0.001, help="Frames a second of a folder of images; default 30."),
     ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE", help="Write poses of tracked frames in TUM's format.")

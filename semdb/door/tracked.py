@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
+from semdb.door.values import Posed
 from semdb.geometry import quat_wxyz_from_rotation
 from semdb.shown import for_terminal
 from semdb.tracking.states import TrackSource, TrackState
@@ -15,7 +13,7 @@ from semdb.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Tracked:
+class Tracked(Posed):
     """Where a moving camera is. `world_from_camera` ``[4, 4]`` and `covariance` ``[6, 6]`` are None when ``lost``.
 
     The pose is metres in the map's world, the covariance of translation (m), then rotation (rad, left perturbation in
@@ -44,26 +42,6 @@ class Tracked:
     def tracking(self) -> bool:
         """Whether the pose is measured in the map, and to be relied on."""
         return self.state is TrackState.TRACKING
-
-    @property
-    def position(self) -> FloatArray | None:
-        """x, y, z ``[3]`` of the camera in the map, metres."""
-        return None if self.world_from_camera is None else self.world_from_camera[:3, 3]
-
-    @property
-    def quat_wxyz(self) -> FloatArray | None:
-        """The rotation ``world_from_camera`` as a quaternion ``[4]``."""
-        return None if self.world_from_camera is None else quat_wxyz_from_rotation(self.world_from_camera[:3, :3])
-
-    @property
-    def sigma_m(self) -> float:
-        """The standard deviation of the position along its least certain direction, metres; NaN without a pose."""
-        return _largest_sigma(self.covariance, 0)
-
-    @property
-    def sigma_deg(self) -> float:
-        """The standard deviation of the rotation about its least certain axis, degrees; NaN without a pose."""
-        return math.degrees(_largest_sigma(self.covariance, 3))
 
     def as_dict(self) -> dict[str, Any]:
         """What ``semdb track --json-lines`` prints for a frame."""
@@ -97,10 +75,3 @@ def _pose_dict(pose: FloatArray | None) -> dict[str, list[float]] | None:
     if pose is None:
         return None
     return {"position": pose[:3, 3].tolist(), "quat_wxyz": quat_wxyz_from_rotation(pose[:3, :3]).tolist()}
-
-
-def _largest_sigma(covariance: FloatArray | None, start: int) -> float:
-    if covariance is None:
-        return math.nan
-    half = covariance[start : start + 3, start : start + 3]
-    return math.sqrt(max(0.0, float(np.linalg.eigvalsh(half)[-1])))

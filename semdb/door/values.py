@@ -91,8 +91,36 @@ class SeenObject:
         return for_terminal(f"<{self.category} {self.score:.2f}{where}>")
 
 
+class Posed:
+    """What a pose and its covariance say; both are None where there is no pose."""
+
+    __slots__ = ()
+    world_from_camera: FloatArray | None
+    covariance: FloatArray | None
+
+    @property
+    def position(self) -> FloatArray | None:
+        """x, y, z ``[3]`` of the camera in the map, metres."""
+        return None if self.world_from_camera is None else self.world_from_camera[:3, 3]
+
+    @property
+    def quat_wxyz(self) -> FloatArray | None:
+        """The rotation ``world_from_camera`` as a quaternion ``[4]``."""
+        return None if self.world_from_camera is None else quat_wxyz_from_rotation(self.world_from_camera[:3, :3])
+
+    @property
+    def sigma_m(self) -> float:
+        """The standard deviation of the position along its least certain direction, metres; NaN without a pose."""
+        return _largest_sigma(self.covariance, 0)
+
+    @property
+    def sigma_deg(self) -> float:
+        """The standard deviation of the rotation about its least certain axis, degrees; NaN without a pose."""
+        return math.degrees(_largest_sigma(self.covariance, 3))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class Answer:
+class Answer(Posed):
     """Where an image was taken. `world_from_camera` ``[4, 4]`` and `covariance` ``[6, 6]`` are None for `failed`.
 
     The pose is metres in the map's world frame, camera axes x right, y down, z forward; the covariance is of
@@ -127,26 +155,6 @@ class Answer:
     def localized(self) -> bool:
         """Whether the pose is to be relied on: the verdict is ``localized``."""
         return self.verdict is Verdict.LOCALIZED
-
-    @property
-    def position(self) -> FloatArray | None:
-        """x, y, z ``[3]`` of the camera in the map, metres."""
-        return None if self.world_from_camera is None else self.world_from_camera[:3, 3]
-
-    @property
-    def quat_wxyz(self) -> FloatArray | None:
-        """The rotation ``world_from_camera`` as a quaternion ``[4]``."""
-        return None if self.world_from_camera is None else quat_wxyz_from_rotation(self.world_from_camera[:3, :3])
-
-    @property
-    def sigma_m(self) -> float:
-        """The standard deviation of the position along its least certain direction, metres; NaN without a pose."""
-        return _largest_sigma(self.covariance, 0)
-
-    @property
-    def sigma_deg(self) -> float:
-        """The standard deviation of the rotation about its least certain axis, degrees; NaN without a pose."""
-        return math.degrees(_largest_sigma(self.covariance, 3))
 
     def picture(self) -> ImageArray:
         """Query and best keyframe with objects and matches, the map from above: RGB uint8 ``[H, W, 3]``.

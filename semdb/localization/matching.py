@@ -52,7 +52,8 @@ class Matches:
         return len(self.query)
 
 
-def _no_matches() -> Matches:
+def no_matches() -> Matches:
+    """No pair at all."""
     empty = np.zeros(0, np.int32)
     return Matches(empty, empty, np.zeros(0, np.float32), np.zeros(0, np.bool_))
 
@@ -188,7 +189,7 @@ def _match_block(
 def _sorted(blocks: Sequence[Matches]) -> Matches:
     """The pairs of all `blocks` by the query's index."""
     if not blocks:
-        return _no_matches()
+        return no_matches()
     i, j = np.concatenate([b.query for b in blocks]), np.concatenate([b.keyframe for b in blocks])
     order = np.lexsort((j, i))
     distance = np.concatenate([b.distance for b in blocks])
@@ -217,7 +218,7 @@ def match_guided(
     options = options or MatchingOptions()
     visible = np.flatnonzero(np.isfinite(projected_xy).all(axis=1))
     if len(query_descriptors) == 0 or len(visible) == 0:
-        return _no_matches()
+        return no_matches()
     if query_signs is None or keyframe_signs is None:
         query_signs, keyframe_signs = np.zeros(len(query_xy), np.int8), np.zeros(len(projected_xy), np.int8)
     i, j = _pairs_within(

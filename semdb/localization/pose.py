@@ -110,7 +110,7 @@ def robust_pnp(
         "max_iterations": max_iterations,
         "seed": 0,
     }
-    pose, report = poselib.estimate_absolute_pose(pixels, points, _pinhole(query), ransac, {"loss_type": "CAUCHY"})
+    pose, report = poselib.estimate_absolute_pose(pixels, points, pinhole(query), ransac, {"loss_type": "CAUCHY"})
     inliers = np.asarray(report["inliers"], np.bool_)
     if inliers.sum() < MINIMUM_PAIRS:
         return None
@@ -121,7 +121,7 @@ def robust_pnp(
     return camera_from_world, inliers
 
 
-def _pinhole(query: View) -> dict[str, Any]:
+def pinhole(query: View) -> dict[str, Any]:
     """The camera of pixels that are undistorted and counted from the centre, as PoseLib wants it."""
     width, height = query.camera.width, query.camera.height
     return {"model": "SIMPLE_PINHOLE", "width": width, "height": height, "params": [query.focal, 0, 0]}
@@ -207,7 +207,7 @@ def _joined_pose(
     start.R, start.t = camera_from_world[:3, :3], camera_from_world[:3, 3]
     pixels = query.xy[pairs.query[near]] * query.focal
     loss = {"loss_type": "CAUCHY", "loss_scale": options.pixel_sigma_px}
-    pose, _ = poselib.refine_absolute_pose(pixels, points[near], start, _pinhole(query), loss)
+    pose, _ = poselib.refine_absolute_pose(pixels, points[near], start, pinhole(query), loss)
     fitted = np.eye(4)
     fitted[:3] = pose.Rt
     agreeing = reprojection_px(query, fitted, pairs.query, points) < options.max_reprojection_px

@@ -11,7 +11,7 @@ import poselib
 from semdb.geometry import invert_pose, transform_points
 from semdb.localization.adjustment import in_front
 from semdb.localization.confidence import gather_evidence, sigmas
-from semdb.localization.matching import Matches
+from semdb.localization.matching import Matches, no_matches
 from semdb.localization.pairs import Pairs, guided_pairs, reprojection_px, world_points_of
 from semdb.localization.pose import (
     FirstPose,
@@ -21,6 +21,7 @@ from semdb.localization.pose import (
     first_pose,
     image_spread,
     match_views,
+    pinhole,
     rival_pose,
     robust_pnp,
 )
@@ -85,7 +86,7 @@ def place_near(
     best = int(counts.argmax())
     support = FirstSupport(inliers, int(counts[best]), share, best)
     start = FirstPose(pose, len(keyframes), support, inliers, image_spread(view, rows), (pairs, points))
-    none = [_no_matches() for _ in keyframes]
+    none = [no_matches() for _ in keyframes]
     estimate = estimate_pose(view, keyframes, none, options.pose, start)
     if estimate is None:
         return None
@@ -116,10 +117,9 @@ def _fitted(view: View, start: FloatArray, pairs: Pairs, points: FloatArray, sca
     """``camera_from_world`` from a start, with a loss that leaves out what is far off; None where it diverges."""
     first = poselib.CameraPose()
     first.R, first.t = start[:3, :3], start[:3, 3]
-    camera = {"model": "SIMPLE_PINHOLE", "width": view.camera.width, "height": view.camera.height}
     pixels = view.xy[pairs.query] * view.focal
     fitted, _ = poselib.refine_absolute_pose(
-        pixels, points, first, {**camera, "params": [view.focal, 0, 0]},
+        pixels, points, first, pinhole(view),
         {"loss_type": "CAUCHY", "loss_scale": scale_px},
     )  # fmt: skip
     pose = np.eye(4)
@@ -244,8 +244,3 @@ def _covariance_of(view: View, pose: FloatArray, pixels: FloatArray, points: Flo
     adjoint[:3, :3] = adjoint[3:, 3:] = rotation.T
     covariance: FloatArray = adjoint @ inverse @ adjoint.T
     return covariance if np.isfinite(covariance).all() else None
-
-
-def _no_matches() -> Matches:
-    empty = np.zeros(0, np.int32)
-    return Matches(empty, empty, np.zeros(0, np.float32), np.zeros(0, np.bool_))

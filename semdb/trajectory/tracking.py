@@ -10,7 +10,7 @@ import numpy as np
 from semdb.geometry import invert_pose, pose_error, transform_points
 from semdb.localization.adjustment import in_front
 from semdb.localization.confidence import gather_evidence, sigmas
-from semdb.localization.matching import Matches
+from semdb.localization.matching import no_matches
 from semdb.localization.pairs import guided_pairs, world_points_of
 from semdb.localization.pose import (
     FirstPose,
@@ -76,7 +76,7 @@ def place_by_motion(
     support = FirstSupport(inliers, int(counts[best]), share, best)
     spread = image_spread(view, pairs.query[agreeing])
     start = FirstPose(pose, len(keyframes), support, inliers, spread)
-    none = [_no_matches() for _ in keyframes]
+    none = [no_matches() for _ in keyframes]
     estimate = estimate_pose(view, keyframes, none, pose_options, start)
     return None if estimate is None else Placed(estimate, tuple(keyframes))
 
@@ -148,8 +148,3 @@ def moved_too_far(pose: FloatArray, predicted: FloatArray, gap_s: float, options
     metres, degrees = pose_error(pose, predicted)
     tenths = max(gap_s / 0.1, 1.0)
     return metres > options.tracking.jump_m * tenths or degrees > options.tracking.jump_deg * tenths
-
-
-def _no_matches() -> Matches:
-    empty = np.zeros(0, np.int32)
-    return Matches(empty, empty, np.zeros(0, np.float32), np.zeros(0, np.bool_))
