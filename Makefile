@@ -5,6 +5,7 @@
 # make test-train   train a small detector on rendered rooms from random weights; 8 minutes on 2 cores
 # make lint   ruff and mypy            make lock    write requirements/constraints.txt anew
 # make bench  all benchmarks, on RECORDINGS="..." or a rendered room
+# make web    build the page of the service from web/ into semdb/service/page (needs node)
 # make wheel  dist/*.whl               make clean   remove what make made
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
@@ -18,7 +19,7 @@ LOCK := requirements/constraints.txt
 # two processes: each starts servers of its own
 PYTEST_ARGS ?= --numprocesses 2
 
-.PHONY: help demo serve test test-long test-train unit lint services lock bench wheel clean
+.PHONY: help demo serve test test-long test-train unit lint services lock bench web wheel clean
 
 help:
 	@sed -n 's/^# \(make \)/\1/p' Makefile
@@ -85,6 +86,14 @@ bench: $(VENV)/.stamp-dev $(RECORDINGS)
 	  name=$${file#bench/}; name=$${name%/__main__.py}; name=$${name%.py}; mkdir -p bench-output; \
 	  echo "== bench.$$name"; $(BIN)/python -m "bench.$$name" $(RECORDINGS) --json "bench-output/$$name.json"; \
 	done
+
+web/node_modules/.stamp: web/package-lock.json
+	@npm --prefix web ci --no-audit --no-fund --loglevel=error
+	@touch $@
+
+web: web/node_modules/.stamp
+	@npm --prefix web run --silent check
+	@npm --prefix web run --silent build
 
 wheel: $(VENV)/.stamp-dev
 	$(BIN)/python -m build --wheel --no-isolation --outdir dist .

@@ -20,6 +20,7 @@ from semdb.errors import SemdbError
 from semdb.events import event
 from semdb.service import (
     delete_routes,
+    explorer,
     health_routes,
     ingest_routes,
     keyframe_routes,
@@ -81,6 +82,7 @@ def make_api(service: Service) -> FastAPI:
     for table in TABLES:
         table.add_to(app)
     session_routes.add_stream(app)
+    explorer.add_page(app)
     app.add_exception_handler(Problem, _on_problem)
     app.add_exception_handler(SemdbError, _on_error)
     app.add_exception_handler(HTTPException, _on_http)
@@ -131,6 +133,8 @@ async def _on_error(request: Request, error: Any) -> Response:
 async def _on_http(request: Request, error: Any) -> Response:
     if isinstance(error.__cause__, Problem):  # of the body, which came too slowly or is too large
         return _answer(request, error.__cause__)
+    if error.status_code == 404 and explorer.is_of_the_page(request):
+        return await explorer.get_page(request)
     details = {404: "there is nothing at this address", 405: "this address takes other methods"}
     detail = details.get(error.status_code, str(error.detail))
     return _answer(request, Problem(error.status_code, detail, headers=error.headers or {}))
