@@ -18,6 +18,8 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 LOCK := requirements/constraints.txt
 # two processes: each starts servers of its own
 PYTEST_ARGS ?= --numprocesses 2
+# byte code is kept: without it each of the tests' many processes would compile semdb anew
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: help demo serve test test-long test-train unit lint services lock bench web wheel clean
 

@@ -36,9 +36,9 @@ def evaluate(shared_dir: Path, tmp_path: Path, recording: str, url: str, *option
 def test_red_kitchen(shared_dir: Path, tmp_path: Path) -> None:
     result = evaluate(
         *(shared_dir, tmp_path, RED_KITCHEN, f"sqlite:///{tmp_path / 'unused.sqlite3'}"),
-        *("--keyframes", 25, "--max-queries", 75),
+        *("--keyframes", 25, "--max-queries", 56),
     )
-    assert (result["frames"], result["keyframes"], result["queries"]) == (250, 25, 75)
+    assert (result["frames"], result["keyframes"], result["queries"]) == (250, 25, 56)
     assert result["success_rate"] >= 0.97
     assert result["median_translation_m"] <= 0.016
     assert result["median_rotation_deg"] <= 0.7
@@ -48,9 +48,10 @@ def test_red_kitchen(shared_dir: Path, tmp_path: Path) -> None:
 @pytest.mark.shared
 def test_freiburg1_rpy(shared_dir: Path, tmp_path: Path) -> None:
     result = evaluate(
-        *(shared_dir, tmp_path, FREIBURG, f"sqlite:///{tmp_path / 'unused.sqlite3'}"), *("--keyframes", 40)
+        *(shared_dir, tmp_path, FREIBURG, f"sqlite:///{tmp_path / 'unused.sqlite3'}"),
+        *("--keyframes", 40, "--max-queries", 54),
     )
-    assert (result["frames"], result["keyframes"], result["queries"]) == (121, 40, 81)
+    assert (result["frames"], result["keyframes"], result["queries"]) == (121, 40, 54)
     assert result["success_rate"] >= 0.93
     assert result["median_translation_m"] <= 0.015
     assert result["median_rotation_deg"] <= 0.95

@@ -38,6 +38,8 @@ NOT_RUN = (
     "models pull",
     "torchvision:",
 )
+# an evaluation asks about fewer images than it would: what they are asked with is the same
+EVALUATION = re.compile(r"^semdb evaluate (?!.*--max-queries)", re.MULTILINE)
 SERVER_URL = re.compile(r"mysql\+pymysql://semdb:PASSWORD@HOST(?::3306)?/semdb")
 
 
@@ -119,7 +121,7 @@ def run(script: str, folder: Path, **variables: str) -> subprocess.CompletedProc
 @pytest.mark.parametrize("path", WITH_COMMANDS, ids=lambda path: path.name)
 def test_commands_of_the_documents_work(path: Path, workplace: Path, any_server_url: str) -> None:
     for block in shell_blocks(path):
-        script = SERVER_URL.sub(any_server_url, block)
+        script = EVALUATION.sub("semdb evaluate --max-queries 8 ", SERVER_URL.sub(any_server_url, block))
         done = run(script, workplace, SEMDB_READER_URL=any_server_url, MODELS=str(workplace))
         assert done.returncode == 0, f"{block}\n{done.stdout}\n{done.stderr}"
 
