@@ -265,7 +265,9 @@ def _check_instances(instances: InstanceMasks | None, name: str, size: tuple[int
             f"{name}: instances.labels must be uint16 [{size[1]}, {size[0]}], not {labels.dtype} {list(labels.shape)}"
         )
     categories: Mapping[int, str] = instances.categories
-    unknown = sorted(set(np.unique(labels).tolist()) - {0} - set(categories))
+    present = np.zeros(2**16, np.bool_)
+    present[labels] = True
+    unknown = sorted(set(np.flatnonzero(present).tolist()) - {0} - set(categories))
     if unknown:
         raise FrameError(f"{name}: instances.categories has no class for the label {unknown[0]}")
     return InstanceMasks(np.ascontiguousarray(labels), categories)

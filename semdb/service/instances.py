@@ -7,9 +7,9 @@ import json
 import numpy as np
 
 from semdb.errors import FrameError, UsageError
-from semdb.recordings.images import decode_color, decode_depth, header_of
+from semdb.recordings.arrays import as_camera
+from semdb.recordings.images import decode_color, decode_depth, decode_gray, header_of
 from semdb.recordings.intrinsics import depth_scale_problem
-from semdb.recordings.memory import make_frame
 from semdb.service.middleware import check_depth
 from semdb.service.problems import Problem
 from semdb.storable_names import name_problem
@@ -44,19 +44,15 @@ def frame_with(
             raise UsageError(problem)
         metres = decode_depth(depth, f"depth of {name}", depth_scale, size)
     masks = InstanceMasks(_labels(instances, size), _categories(categories))
-    return make_frame(0, pixels, depth=metres, camera=camera, name=name, instances=masks)
+    # the library checks every frame that it is asked about: `make_frame` would do that a second time
+    return Frame(0, name, None, pixels, metres, as_camera(camera, size), None, instances=masks)
 
 
 def _labels(data: bytes, size: tuple[int, int]) -> np.ndarray[tuple[int, ...], np.dtype[np.uint16]]:
-    import cv2
-
     header = header_of(data, "instances")
     if header.kind != "png" or header.channels != 1 or header.size != size:
         raise FrameError(f"instances: a PNG of one channel and of the image's size {size[0]}x{size[1]} is needed")
-    labels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if labels is None or labels.ndim != 2 or labels.shape[::-1] != size:
-        raise FrameError("instances: the PNG cannot be decoded")
-    return np.asarray(labels, np.uint16)
+    return np.asarray(decode_gray(data, "instances"), np.uint16)
 
 
 def _categories(text: str) -> dict[int, str]:

@@ -70,7 +70,7 @@ class Given:
     instances: bytes | None = None
 
 
-def query_of(
+async def query_of(
     request: Request,
     camera: CameraText = None,
     like: Like = None,

@@ -191,7 +191,8 @@ class Patience:
                 return await receive()
             wait = min(settings.body_timeout_s, deadline - time.monotonic())
             try:
-                message = await asyncio.wait_for(receive(), max(0.0, wait))
+                async with asyncio.timeout(max(0.0, wait)):
+                    message = await receive()
             except TimeoutError:
                 raise Problem(408, "the request came too slowly", headers={"Connection": "close"}) from None
             came += len(message.get("body", b""))
@@ -202,7 +203,8 @@ class Patience:
 
         async def given(message: Message) -> None:
             try:
-                await asyncio.wait_for(send(message), settings.body_timeout_s)
+                async with asyncio.timeout(settings.body_timeout_s):
+                    await send(message)
             except TimeoutError:
                 raise Problem(408, "the client takes nothing") from None
 
