@@ -76,7 +76,10 @@ class Settings(BaseSettings):
     encoder: str = Field(
         "auto", description="auto, onnx:FILE, torchvision:NAME or gist. auto: a query takes the map's own"
     )
-    features: str = Field("auto", description="auto, surf, sift or orb. auto: the map's own, or surf")
+    features: str = Field("auto", description="auto, surf, sift, orb or onnx:FILE. auto: the map's own, or surf")
+    matcher: str | None = Field(
+        None, description="onnx:FILE: a network that matches learned features; default: nearest neighbours"
+    )
     words: str | None = Field(
         None, description="onnx:FILE: a sentence network for words that `semdb find` does not know; default: none"
     )

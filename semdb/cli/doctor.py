@@ -189,6 +189,7 @@ def models(settings: Settings) -> Iterator[Check]:
         "features": load_features,
     }
     yield from words(settings)
+    yield from matcher(settings)
     for role, load in loaders.items():
         spec = str(getattr(settings, role))
         if spec == "auto":
@@ -199,6 +200,20 @@ def models(settings: Settings) -> Iterator[Check]:
             yield Check("ok", role, spec)
         except SemdbError as error:
             yield Check("problem", role, str(error))
+
+
+def matcher(settings: Settings) -> Iterator[Check]:
+    """Whether the matcher of learned features can be loaded, where one is named."""
+    from semdb.errors import SemdbError
+    from semdb.perception.matchers import load_matcher
+
+    if settings.matcher is None:
+        return
+    try:
+        load_matcher(settings.matcher, settings)
+        yield Check("ok", "matcher", settings.matcher)
+    except SemdbError as error:
+        yield Check("problem", "matcher", str(error))
 
 
 def words(settings: Settings) -> Iterator[Check]:

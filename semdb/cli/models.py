@@ -37,6 +37,8 @@ SPECS = (
     ("features", "surf", False, "SURF, 64 dimensions"),
     ("features", "sift", False, "SIFT of OpenCV"),
     ("features", "orb", False, "ORB of OpenCV, binary"),
+    ("features", "onnx:FILE", True, "a network from image [1,3,H,W] to keypoints, scores, descriptors"),
+    ("matcher", "onnx:FILE", True, "a network that matches learned features (SEMDB_MATCHER)"),
 )
 
 

@@ -16,7 +16,7 @@ from semdb.evaluation.metrics import QueryResult, query_result, with_reach
 from semdb.evaluation.retrieval import FIRST, reach
 from semdb.evaluation.tasks import Part, Task
 from semdb.ingestion.run import IngestOptions, ingest_recording
-from semdb.localization.images import make_localizer
+from semdb.localization.images import make_localizer, with_matcher
 from semdb.localization.localizer import Localizer
 from semdb.localization.query_image import frame_at_scale
 from semdb.perception.describe import Describer, describer_from_specs
@@ -228,7 +228,10 @@ def open_run(
     if all(info.name != map_name for info in store.maps()):
         _fill(map_name, task, describer, store, progress)
     options = replace(method.options.with_threads(describers.settings.threads), accept=accept)
-    localizer = make_localizer(store, store.find_map(map_name), coarse, options)
+    info = store.find_map(map_name)
+    if method.features is None:  # those that name their feature name their matching too
+        options = with_matcher(options, describers.settings, store.map_models(info.id))
+    localizer = make_localizer(store, info, coarse, options)
     run = OracleRun if method.name.startswith(ORACLE) else LocalizerRun
     return run(method, describer, localizer, query_depth or method.query_depth, store)
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 from semdb.database.records import MapHead, MapInfo
 from semdb.database.refinements import CLASSES
@@ -12,11 +12,12 @@ from semdb.errors import UsageError
 from semdb.localization.coarse import CoarseSource
 from semdb.localization.index import IndexOptions, IndexSource, MapIndex
 from semdb.localization.keyframe_cache import STALE, KeyframeCache
+from semdb.localization.learned_matching import is_learned
 from semdb.localization.localizer import Localizer, LocalizerOptions
 from semdb.localization.query_image import QueryImage
 from semdb.localization.sources import SqlSource
 from semdb.settings import Settings
-from semdb.types import Description, Localization
+from semdb.types import Description, Localization, ModelInfo
 
 COARSE = ("sql", "index")
 
@@ -71,12 +72,31 @@ def localizer_on(
         say(f"map {info.name!r} has changed since semdb refine; the class confusions of then are used")
     for found in store.class_confusions(info.id):
         confusions.setdefault(found.category, {})[found.other] = found.weight
+    models = store.map_models(info.id)
     if settings is not None:
-        options = (options or LocalizerOptions()).with_threads(settings.threads)
+        options = with_matcher((options or LocalizerOptions()).with_threads(settings.threads), settings, models)
     cache = KeyframeCache(store, info.id, refined=options is None or options.refined_points)
     if say is not None and cache.points == STALE:
         say(f"map {info.name!r} has changed since semdb refine; its refined points are not used: run semdb refine")
-    return Localizer(info.name, store.map_models(info.id), source, cache, options, confusions)
+    return Localizer(info.name, models, source, cache, options, confusions)
+
+
+def with_matcher(options: LocalizerOptions, settings: Settings, models: Sequence[ModelInfo]) -> LocalizerOptions:
+    """`options` with the matcher of `settings`, where they name one.
+
+    Raises UsageError where the `models` of the map have no learned feature, or there is no such file.
+    """
+    if settings.matcher is None or not models:
+        return options
+    feature = next((model.name for model in models if model.role == "features"), "none")
+    if not is_learned(models):
+        raise UsageError(
+            f"SEMDB_MATCHER={settings.matcher} matches learned features, and the map was described by {feature}: unset "
+            "it, or ingest with SEMDB_FEATURES=onnx:FILE"
+        )
+    from semdb.perception.matchers import load_matcher
+
+    return replace(options, pose=replace(options.pose, matcher=load_matcher(settings.matcher, settings)))
 
 
 def open_index(

@@ -30,6 +30,7 @@ from semdb.localization.keyframe_cache import KeyframeCache
 from semdb.localization.laid_pose import LaidOptions, LaidPose, estimate_with, is_one, judge_with, may_overrule
 from semdb.localization.landmark_pose import LandmarkPoseOptions
 from semdb.localization.landmark_step import landmark_pose
+from semdb.localization.learned_matching import for_learned, is_learned
 from semdb.localization.neighbours import by_side
 from semdb.localization.pose import (
     PoseEstimate,
@@ -81,6 +82,12 @@ class LocalizerOptions:
         """The same with so many threads for a query."""
         return replace(self, pose=replace(self.pose, threads=threads))
 
+    def for_models(self, models: Sequence[ModelInfo]) -> LocalizerOptions:
+        """The same with the thresholds that the local feature among `models` needs."""
+        if not is_learned(models):
+            return self
+        return replace(self, pose=replace(self.pose, matching=for_learned(self.pose.matching)))
+
 
 class Localizer:
     """Localizes descriptions in one map.
@@ -102,7 +109,7 @@ class Localizer:
         self.models = tuple(models)
         self.source = source
         self.cache = cache
-        self.options = options or LocalizerOptions()
+        self.options = (options or LocalizerOptions()).for_models(self.models)
         self.confusions = confusions or {}  # class -> classes it is taken for -> weight in millionths
 
     def localize(self, description: Description, accept: Tolerance | None = None) -> Localization:

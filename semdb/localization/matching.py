@@ -30,13 +30,18 @@ class Evidence(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class MatchingOptions:
-    """Ratio tests compare nearest with second nearest distance; smaller is stricter."""
+    """Ratio tests compare nearest with second nearest distance; smaller is stricter.
+
+    Ceilings are squared distances of float descriptors that a pair has to stay below.
+    """
 
     evidence: Evidence = Evidence.ALL
     ratio: float = 0.85
     contradiction_ratio: float = 0.75
     guided_radius_px: float = 12.0
     guided_ratio: float = 0.92
+    ceiling: float = float("inf")
+    guided_ceiling: float = 0.5  # cosine .75: a pair without competitors must still look alike
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,8 +96,8 @@ class _Mutual:
     distance: Float32Array  # [k]
     second: Float32Array  # [k] distance of the second nearest column, inf where there is none
 
-    def passing(self, ratio: float | FloatArray) -> BoolArray:
-        return np.asarray(self.distance < ratio * self.second)
+    def passing(self, ratio: float | FloatArray, ceiling: float) -> BoolArray:
+        return np.asarray((self.distance < ratio * self.second) & (self.distance < ceiling))
 
 
 def _mutual(
@@ -162,14 +167,14 @@ def _match_block(
 ) -> Matches:
     """Pairs of descriptors that may all be compared. First the whole image, then what the classes add."""
     close, dtype = closeness(query_descriptors, keyframe_descriptors), query_descriptors.dtype
-    power = _ratio_power(dtype)
+    power, ceiling = _ratio_power(dtype), float("inf") if dtype == np.uint8 else options.ceiling
     taken_query, taken_keyframe = (np.zeros(size, np.bool_) for size in close.shape)
     found: list[tuple[IntArray, IntArray]] = []
     if options.evidence is Evidence.ALL:
         pairs = _mutual(close, dtype)
         q, k = query_classes[pairs.rows], keyframe_classes[pairs.columns]
         contradicts = (q != k) & (q != BACKGROUND) & (k != BACKGROUND)
-        keep = pairs.passing(np.where(contradicts, options.contradiction_ratio, options.ratio) ** power)
+        keep = pairs.passing(np.where(contradicts, options.contradiction_ratio, options.ratio) ** power, ceiling)
         found.append((pairs.rows[keep], pairs.columns[keep]))
         taken_query[pairs.rows[keep]] = taken_keyframe[pairs.columns[keep]] = True
     for category in np.intersect1d(query_classes, keyframe_classes):
@@ -178,7 +183,7 @@ def _match_block(
         rows = np.flatnonzero(query_classes == category).astype(np.int32)
         columns = np.flatnonzero(keyframe_classes == category).astype(np.int32)
         pairs = _mutual(close, dtype, rows, columns)
-        keep = pairs.passing(options.ratio**power) & ~taken_query[pairs.rows] & ~taken_keyframe[pairs.columns]
+        keep = pairs.passing(options.ratio**power, ceiling) & ~taken_query[pairs.rows] & ~taken_keyframe[pairs.columns]
         found.append((pairs.rows[keep], pairs.columns[keep]))
     i = np.concatenate([pair[0] for pair in found]) if found else np.zeros(0, np.int32)
     j = np.concatenate([pair[1] for pair in found]) if found else np.zeros(0, np.int32)
@@ -230,7 +235,7 @@ def match_guided(
         i, j, same_class = i[same_class], j[same_class], same_class[same_class]
     distance = _paired_distances(query_descriptors, keyframe_descriptors, i, j)
     ratio = options.guided_ratio ** _ratio_power(query_descriptors.dtype)
-    ceiling = _distance_ceiling(query_descriptors.dtype, query_descriptors.shape[1])
+    ceiling = _guided_ceiling(query_descriptors, options)
     best, second = _two_least(distance, i, len(query_descriptors))
     best_back, _ = _two_least(distance, j, len(keyframe_descriptors))
     accepted = (
@@ -286,6 +291,6 @@ def _two_least(values: Float32Array, groups: IntArray, count: int) -> tuple[Floa
     return least, second
 
 
-def _distance_ceiling(dtype: np.dtype[np.generic], width: int) -> float:
-    """A pair without competitors must still look alike: cosine .75, or a quarter of the bits different."""
-    return width * 8 * 0.25 if dtype == np.uint8 else 0.5
+def _guided_ceiling(descriptors: npt.NDArray[np.generic], options: MatchingOptions) -> float:
+    """A pair without competitors must still look alike: of bits at most a quarter may differ."""
+    return descriptors.shape[1] * 8 * 0.25 if descriptors.dtype == np.uint8 else options.guided_ceiling

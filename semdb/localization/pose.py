@@ -13,6 +13,7 @@ from semdb.geometry import invert_pose, pose_error, transform_points
 from semdb.localization.adjustment import bundle_adjust, in_front, project_adjusted, projected_error_px
 from semdb.localization.alignment import Alignment, align_pairs
 from semdb.localization.bundle import BundleResult
+from semdb.localization.learned_matching import KeypointMatcher, match_by
 from semdb.localization.matching import Matches, MatchingOptions, match_keypoints
 from semdb.localization.pairs import Pairs, guided_pairs, join_pairs, reprojection_px, world_points_of
 from semdb.localization.pose_options import PoseOptions
@@ -85,12 +86,18 @@ class PoseEstimate:
 
 def match_views(query: View, keyframes: Sequence[KeyframeView], options: PoseOptions) -> list[Matches]:
     """First matching with each of `keyframes`, without a pose."""
-    return each(lambda keyframe: match_view(query, keyframe, options.matching), keyframes, options.threads)
+    return each(
+        lambda keyframe: match_view(query, keyframe, options.matching, options.matcher), keyframes, options.threads
+    )
 
 
-def match_view(query: View, keyframe: KeyframeView, options: MatchingOptions) -> Matches:
-    """First matching, without a pose."""
+def match_view(
+    query: View, keyframe: KeyframeView, options: MatchingOptions, matcher: KeypointMatcher | None = None
+) -> Matches:
+    """First matching, without a pose; by a `matcher` where there is one, else by nearest neighbours."""
     view = keyframe.view
+    if matcher is not None:
+        return match_by(matcher, query, view, options)
     return match_keypoints(
         query.descriptors, view.descriptors, query.classes, view.classes, options,
         query_signs=query.signs, keyframe_signs=view.signs,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from semdb.localization.bundle import MotionPrior
+from semdb.localization.learned_matching import KeypointMatcher
 from semdb.localization.matching import MatchingOptions
 from semdb.threads import cores
 
@@ -14,6 +15,7 @@ class PoseOptions:
     """Pixels are of the query image."""
 
     matching: MatchingOptions = field(default_factory=MatchingOptions)
+    matcher: KeypointMatcher | None = None  # of the first matching; None: nearest neighbours
     max_reprojection_px: float = 5.0
     inlier_px: float = 4.0
     close_radius_px: float = 6.0  # of guided matching once images' turns are known

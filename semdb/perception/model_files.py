@@ -132,6 +132,11 @@ class OnnxModel:
         self.takes_batches = inputs[0].shape[0] != 1  # a name or None where it is free
         self.on_gpu = "CUDAExecutionProvider" in self._session.get_providers()
 
+    def last_size(self, output: str) -> int | None:
+        """The length of the last axis of an output, where the file says it."""
+        shape = next(found.shape for found in self._session.get_outputs() if found.name == output)
+        return int(shape[-1]) if shape and isinstance(shape[-1], int) else None
+
     def run(self, batch: Any) -> list[Any]:
         """The required outputs, in their order, for a float32 `batch` ``[B, 3, H, W]``. Raises ModelError."""
         try:

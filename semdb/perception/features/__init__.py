@@ -10,9 +10,9 @@ KNOWN = ("surf", "sift", "orb")
 
 
 def load_features(spec: str, settings: Settings) -> FeatureExtractor:
-    """The local feature of a `spec`: ``surf``, ``sift`` or ``orb``, with at most ``settings.max_keypoints`` per image.
+    """The local feature of a `spec`: ``surf``, ``sift``, ``orb`` or ``onnx:FILE``; ``settings.max_keypoints`` an image.
 
-    Raises UsageError for another spec.
+    Raises UsageError for another spec, ModelError when a file is missing or is no feature.
     """
     if spec == "surf":
         from semdb.perception.features.surf_features import SurfFeatures
@@ -26,4 +26,8 @@ def load_features(spec: str, settings: Settings) -> FeatureExtractor:
         from semdb.perception.features.orb import OrbFeatures
 
         return OrbFeatures(max_keypoints=settings.max_keypoints)
-    raise UsageError(f"no local feature {spec!r}: SEMDB_FEATURES knows {', '.join(KNOWN)}")
+    if spec.startswith("onnx:"):
+        from semdb.perception.features.onnx import OnnxFeatures
+
+        return OnnxFeatures(spec, settings)
+    raise UsageError(f"no local feature {spec!r}: SEMDB_FEATURES knows {', '.join(KNOWN)} and onnx:FILE")
