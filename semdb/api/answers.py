@@ -6,10 +6,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from semdb.database.records import KeyframeHead
 from semdb.database.store import Store
+from semdb.door.matched import MatchedPixels
 from semdb.door.values import Answer, Keyframe, KeyframeContent, SeenObject, frozen
-from semdb.types import Camera, ConsistentPose, Float32Array, ImageArray, Keypoints
+from semdb.types import Camera, ConsistentPose, Float32Array, ImageArray, Keypoints, Localization
 
 if TYPE_CHECKING:
     from semdb.localization.images import ImageLocalization
@@ -57,8 +60,16 @@ def answer_of(found: ImageLocalization, store: Callable[[], Store]) -> Answer:
         timing_ms=localization.timing_ms,
         frame_index=query.frame_index,
         timestamp_ns=query.timestamp_ns,
+        matches=_matches(localization),
         draw=draw,
     )
+
+
+def _matches(found: Localization) -> MatchedPixels | None:
+    if found.best_keyframe_id is None or found.query_xy is None or found.keyframe_xy is None:
+        return None
+    one, other = (frozen(np.asarray(xy, np.float64)) for xy in (found.query_xy, found.keyframe_xy))
+    return MatchedPixels(found.best_keyframe_id, one, other)
 
 
 def keyframe_of(head: KeyframeHead, content: KeyframeContent) -> Keyframe:

@@ -13,7 +13,8 @@ from semdb.names import storable
 
 if TYPE_CHECKING:
     from semdb.database.landmark_reading import StoredRelation
-    from semdb.database.query_log import LoggedQuery
+    from semdb.database.query_log import LoggedQuery, QueryFilter
+    from semdb.database.records import FailedItem
     from semdb.localization.coverage import Coverage
 
 
@@ -68,16 +69,36 @@ class Surveying(Base):
         place = None if position is None else (float(position[0]), float(position[1]), float(position[2]))
         return coverage_of(head.name, np.array(ids, np.int64), poses, place, float(radius_m))
 
-    def queries(self, map: str, *, before: int | None = None, limit: int = 100) -> list[LoggedQuery]:
+    def title_keyframe(self, map: str) -> int | None:
+        """The id of the keyframe that shows most classes of a map; None where it has none. Raises NotFoundError."""
+        from semdb.database.lookups import title_keyframe
+
+        return title_keyframe(self._store().engine, self._head(map).id)
+
+    def failures(self, recording: str, map: str) -> list[FailedItem]:
+        """The keyframes of a recording that could not be stored, and why. Raises NotFoundError."""
+        store = self._store()
+        return store.failed_items(store.find_recording(self._head(map).id, storable(recording)))
+
+    def queries(
+        self, map: str, *, before: int | None = None, limit: int = 100, wanted: QueryFilter | None = None
+    ) -> list[LoggedQuery]:
         """What was localized in a map, the newest first; `before` the id of the last one that is known already.
 
-        Raises NotFoundError, UsageError for a limit that is none, CodecError for a damaged row.
+        With `wanted` only what it asks for. Raises NotFoundError, UsageError for a limit that is none, CodecError for a
+        damaged row.
         """
         from semdb.database.query_log import list_queries
 
         if not 1 <= limit <= 10_000:
             raise UsageError(f"limit is between 1 and 10000, not {limit}")
-        return list_queries(self._store().engine, self._head(map).id, before=before, limit=limit)
+        return list_queries(self._store().engine, self._head(map).id, before=before, limit=limit, wanted=wanted)
+
+    def query(self, query_id: int) -> tuple[str, LoggedQuery]:
+        """A logged localization, and the name of its map. Raises NotFoundError, CodecError."""
+        from semdb.database.query_log import find_query
+
+        return find_query(self._store().engine, query_id)
 
     def forget_queries(self, older_than_s: int) -> int:
         """Deletes what was logged more than so many seconds ago, in all maps. Returns how many."""

@@ -26,6 +26,14 @@ class Working(Base):
 
         return find_job(self._store().engine, job_id)
 
+    def jobs(
+        self, map: str | None = None, *, who: str | None = None, before: int | None = None, limit: int = 100
+    ) -> list[Job]:
+        """The newest jobs of a map, or of all, or of whoever asked for them; `before` the id of the last known one."""
+        from semdb.database.jobs import list_jobs
+
+        return list_jobs(self._store().engine, map, who=who, before=before, limit=limit)
+
     def open_jobs(self) -> int:
         """How many jobs wait or run."""
         from semdb.database.jobs import open_jobs

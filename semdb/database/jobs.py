@@ -65,6 +65,20 @@ def find_job(engine: Engine, job_id: int) -> Job:
     return _job(row)
 
 
+def list_jobs(
+    engine: Engine, map_name: str | None = None, *, who: str | None = None, before: int | None = None, limit: int = 100
+) -> list[Job]:
+    """The newest jobs, of a map, of whoever asked for them. Raises CodecError for a damaged row."""
+    query = select(service_jobs).order_by(_j.id.desc()).limit(int(limit))
+    if map_name is not None:
+        query = query.where(_j.map == map_name)
+    if who is not None:
+        query = query.where(_j.who == who)
+    if before is not None:
+        query = query.where(_j.id < int(before))
+    return [_job(row) for row in retry.read(engine, lambda connection: list(connection.execute(query)))]
+
+
 def claim_job(engine: Engine) -> Job | None:
     """The oldest job that nobody works on, for `LEASE_S`; None where there is none."""
     free = or_(_j.state == WAITING, and_(_j.state == RUNNING, _j.lease_until < now_plus(0)))

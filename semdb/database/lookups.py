@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from sqlalchemy import Connection, Engine, exists, select
+from sqlalchemy import Connection, Engine, exists, func, select
 from sqlalchemy.sql.elements import ColumnElement
 
 from semdb.database import checked, retry
@@ -165,3 +165,22 @@ def category_counts(engine: Engine, map_id: int) -> list[tuple[int, str, int]]:
     rows = retry.read(engine, lambda c: list(c.execute(query)))
     where = "keyframe_categories.count of keyframe"
     return [(int(key), str(name), checked.integer(count, f"{where} {key}")) for key, name, count in rows]
+
+
+def title_keyframe(engine: Engine, map_id: int) -> int | None:
+    """The keyframe that shows most classes, then most objects, of a map; any where there are none; None without."""
+    c, k, r = keyframe_categories.c, keyframes.c, recordings.c
+    richest = (
+        select(c.keyframe_id)
+        .where(c.map_id == map_id, c.count > 0)
+        .group_by(c.keyframe_id)
+        .order_by(func.count().desc(), func.sum(c.count).desc(), c.keyframe_id)
+        .limit(1)
+    )
+    first = (
+        select(func.min(k.id)).select_from(keyframes.join(recordings, r.id == k.recording_id)).where(r.map_id == map_id)
+    )
+    found = retry.read(engine, lambda connection: connection.execute(richest).scalar())
+    if found is None:
+        found = retry.read(engine, lambda connection: connection.execute(first).scalar())
+    return None if found is None else int(found)

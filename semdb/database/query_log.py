@@ -7,16 +7,31 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from sqlalchemy import Engine, delete, select
+from sqlalchemy import ColumnElement, Engine, and_, delete, func, not_, or_, select, true
 
 from semdb.database import checked, retry
 from semdb.database.clock import now_plus
 from semdb.database.keyframe_rows import pose_of
-from semdb.database.tables import POSE_COLUMNS, queries
-from semdb.errors import CodecError
+from semdb.database.tables import POSE_COLUMNS, maps, queries
+from semdb.errors import CodecError, NotFoundError
 from semdb.types import FloatArray
 
 CHUNK = 500  # rows that are deleted in one transaction
+
+
+@dataclass(frozen=True, slots=True)
+class QueryFilter:
+    """Which logged localizations are wanted. `text` is part of the image's name or of the reason; times are UTC.
+
+    Without `by_path` folders of an image do not count: whoever may not see them cannot ask for them, either.
+    """
+
+    verdict: str | None = None
+    text: str | None = None
+    since: datetime | None = None
+    until: datetime | None = None
+    keyframe_id: int | None = None
+    by_path: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,12 +51,54 @@ class LoggedQuery:
     timing_ms: dict[str, float]
 
 
-def list_queries(engine: Engine, map_id: int, *, before: int | None = None, limit: int = 100) -> list[LoggedQuery]:
+def list_queries(
+    engine: Engine, map_id: int, *, before: int | None = None, limit: int = 100, wanted: QueryFilter | None = None
+) -> list[LoggedQuery]:
     """The newest `limit` of a map, of those with smaller ids than `before`. Raises CodecError for a damaged row."""
     query = select(queries).where(queries.c.map_id == map_id).order_by(queries.c.id.desc()).limit(int(limit))
     if before is not None:
         query = query.where(queries.c.id < int(before))
+    if wanted is not None:
+        query = query.where(*_conditions(wanted))
     return [_query(row) for row in retry.read(engine, lambda c: list(c.execute(query)))]
+
+
+def find_query(engine: Engine, query_id: int) -> tuple[str, LoggedQuery]:
+    """The name of the map, and what was logged. Raises NotFoundError, CodecError for a damaged row."""
+    statement = (
+        select(queries, maps.c.name.label("map"))
+        .select_from(queries.join(maps, maps.c.id == queries.c.map_id))
+        .where(queries.c.id == int(query_id))
+    )
+    row = retry.read(engine, lambda c: c.execute(statement).one_or_none())
+    if row is None:
+        raise NotFoundError(f"there is no query {query_id}")
+    return checked.text(row.map, f"maps.name of query {query_id}"), _query(row)
+
+
+def _conditions(wanted: QueryFilter) -> list[ColumnElement[bool]]:
+    c, found = queries.c, []
+    if wanted.verdict is not None:
+        found.append(c.verdict == wanted.verdict)
+    if wanted.text is not None:
+        image = _holds(c.image, wanted.text)
+        if not wanted.by_path:
+            folder = true() if "/" in wanted.text else _holds(c.image, wanted.text, "/")  # has a slash behind it
+            image = and_(image, not_(folder))
+        found.append(or_(image, _holds(c.reason, wanted.text)))
+    if wanted.since is not None:
+        found.append(c.created_at >= wanted.since)
+    if wanted.until is not None:
+        found.append(c.created_at < wanted.until)
+    if wanted.keyframe_id is not None:
+        found.append(_holds(c.candidates, f'"keyframe": {int(wanted.keyframe_id)},'))
+    return found
+
+
+def _holds(column: Any, text: str, later: str = "") -> ColumnElement[bool]:
+    """Whether a text is part of a column, and `later` comes behind it; capital letters are as small ones."""
+    escaped = text.lower().replace("!", "!!").replace("%", "!%").replace("_", "!_")
+    return func.lower(column).like(f"%{escaped}%" + (f"{later}%" if later else ""), escape="!")
 
 
 def _query(row: Any) -> LoggedQuery:

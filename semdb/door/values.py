@@ -10,6 +10,7 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
+from semdb.door.matched import MatchedPixels
 from semdb.errors import UsageError
 from semdb.geometry import quat_wxyz_from_rotation, transform_points
 from semdb.shown import for_terminal, measure
@@ -149,6 +150,7 @@ class Answer(Posed):
     frame_index: int | None = None
     timestamp_ns: int | None = None
     others: tuple[ConsistentPose, ...] = ()
+    matches: MatchedPixels | None = None  # with the best keyframe; None where none was matched, or was not asked for
     draw: Callable[[], ImageArray] | None = field(default=None, repr=False)
 
     @property

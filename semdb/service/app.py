@@ -23,8 +23,10 @@ from semdb.service import (
     explorer,
     health_routes,
     ingest_routes,
+    job_routes,
     keyframe_routes,
     localize_routes,
+    log_routes,
     map_routes,
     schemas,
     session_routes,
@@ -44,6 +46,8 @@ TABLES = (
     sql_routes.table,
     delete_routes.table,
     ingest_routes.table,
+    log_routes.table,
+    job_routes.table,
 )
 ABOUT = """Maps, recordings, keyframes and things of a visual semantic database, and where images were taken.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from typing import Annotated, Any
 
 from fastapi import Body, Form, Path, Query, Request
@@ -23,7 +23,7 @@ from semdb.service.answers import as_json, encoded
 from semdb.service.ingesting import path_below
 from semdb.service.localize_routes import Depth, Image, check_pixels
 from semdb.service.problems import Problem, busy, not_found
-from semdb.service.roles import ADMIN, INGEST
+from semdb.service.roles import ADMIN, INGEST, Access
 from semdb.service.routing import MapName, Table
 from semdb.service.state import access_of, read, service_of
 from semdb.service.uploads import live_frame, packed_of
@@ -76,14 +76,16 @@ async def ingest(request: Request, map: MapName, body: Annotated[NewIngest, Body
     else:
         asked["path"] = await service.reading.run(lambda: path_below(str(body.path), service.settings.roots))
 
-    def add(db: Database) -> Job:
-        if db.open_jobs() >= MOST_JOBS:
-            raise busy(f"{MOST_JOBS} jobs wait", 60)
-        return db.job(db.add_job(map, access.who, asked))
-
-    job = await read(request, add)
+    job = await read(request, lambda db: new_job(db, map, access.who, asked))
     service.wake_jobs()
-    return as_json(_shown(job, None, None), 202)
+    return as_json(job_dict(job, None, None), 202)
+
+
+def new_job(db: Database, map: str, who: str, asked: Mapping[str, Any]) -> Job:
+    """A new job. Raises Problem 429 where too many wait."""
+    if db.open_jobs() >= MOST_JOBS:
+        raise busy(f"{MOST_JOBS} jobs wait", 60)
+    return db.job(db.add_job(map, who, asked))
 
 
 @table.route("GET", "/v1/jobs/{job}", INGEST, schemas.JobModel)
@@ -130,15 +132,21 @@ async def _look(request: Request, job_id: int) -> dict[str, Any]:
     service, access = service_of(request), access_of(request)
 
     def look(db: Database) -> dict[str, Any]:
-        job = db.job(job_id)
-        if not access.sees(job.map) or not (access.has(ADMIN) or job.who == access.who):
-            raise not_found(f"job {job_id}")
-        return _shown(job, _items(db, job), service.progress_of(job.id))
+        job = job_of(db, job_id, access)
+        return job_dict(job, items_of(db, job), service.progress_of(job.id))
 
     return await read(request, look)
 
 
-def _items(db: Database, job: Job) -> dict[str, int] | None:
+def job_of(db: Database, job_id: int, access: Access) -> Job:
+    """A job that whoever asks may see. Raises Problem 404."""
+    job = db.job(job_id)
+    if not access.sees(job.map) or not (access.has(ADMIN) or job.who == access.who):
+        raise not_found(f"job {job_id}")
+    return job
+
+
+def items_of(db: Database, job: Job) -> dict[str, int] | None:
     """Keyframes of a job's recordings by their state."""
     names = {str(one["recording"]) for one in job.result}
     if not names:
@@ -154,7 +162,8 @@ def _items(db: Database, job: Job) -> dict[str, int] | None:
     return counts
 
 
-def _shown(job: Job, items: dict[str, int] | None, now: tuple[str, int, int] | None) -> dict[str, Any]:
+def job_dict(job: Job, items: dict[str, int] | None, now: tuple[str, int, int] | None) -> dict[str, Any]:
+    """A job as it is answered with; where its recording lies is not told but by its own name."""
     state = job.state
     if state == PLANNED:
         left = sum((items or {}).get(one, 0) for one in ("pending", "running"))
@@ -163,6 +172,7 @@ def _shown(job: Job, items: dict[str, int] | None, now: tuple[str, int, int] | N
         "job": job.id,
         "address": f"/v1/jobs/{job.id}",
         "map": job.map,
+        "name": str(job.request.get("name") or str(job.request.get("path", "")).rpartition("/")[2]),
         "state": state,
         "recordings": list(job.result),
         "items": items,

@@ -19,7 +19,7 @@ from semdb.service.problems import Problem, problem_of, scrubbed
 from semdb.service.roles import LOCALIZE, Access
 from semdb.service.routing import MapName, Table
 from semdb.service.state import Service, access_of, gone, service_of, with_notes
-from semdb.service.values import answer_dict
+from semdb.service.values import answer_dict, matches_dict
 
 table = Table("localization")
 Name = Annotated[str | None, Form(max_length=255, description="what the image is called in answer and log")]
@@ -29,6 +29,7 @@ CameraText = Annotated[
 Like = Annotated[str | None, Form(max_length=255, description="a recording whose camera and depth scale it has")]
 DepthScale = Annotated[float | None, Form(description="units per metre of the depth image")]
 Masks = Annotated[bool, Form(description="with the pixels of each object")]
+Matches = Annotated[bool, Form(description="with the pixels that match the best keyframe's")]
 AcceptM = Annotated[
     float | None, Form(gt=0, le=1000, description="with accept_deg: poses that differ by no more are one, metres")
 ]
@@ -59,6 +60,7 @@ class Query:
     frame_index: int | None = None
     timestamp_ns: int | None = None
     accept: tuple[float, float] | None = None
+    matches: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,10 +84,11 @@ async def query_of(
     timestamp_ns: Timestamp = None,
     accept_m: AcceptM = None,
     accept_deg: AcceptDeg = None,
+    matches: Matches = False,
 ) -> Query:
     """What the fields of a form ask for, in the map of the address, or those that the token is for."""
     asked = request.path_params.get("map", access_of(request).map)
-    more = (categories or None, frame_index, timestamp_ns, _accept(accept_m, accept_deg))
+    more = (categories or None, frame_index, timestamp_ns, _accept(accept_m, accept_deg), matches)
     return Query(asked, camera or None, like or None, depth_scale, masks, log, *more)
 
 
@@ -201,7 +204,8 @@ def work_of(service: Service, access: Access, query: Query, given: Given, name: 
         answer, notes = with_notes(ask)
         service.answered(str(answer.verdict))
         own = {"frame_index": query.frame_index, "timestamp_ns": query.timestamp_ns}
-        return answer_dict(answer, masks=query.masks, notes=[scrubbed(line) for line in notes]) | own
+        told = answer_dict(answer, masks=query.masks, notes=[scrubbed(line) for line in notes])
+        return told | own | ({"matches": matches_dict(answer)} if query.matches else {})
 
     return work
 

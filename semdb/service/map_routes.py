@@ -9,13 +9,15 @@ from starlette.responses import Response
 
 from semdb.api import Database
 from semdb.service import schemas, values
-from semdb.service.answers import as_json, page_of
+from semdb.service.answers import as_json, page_of, tagged
+from semdb.service.pictures import small
 from semdb.service.problems import Problem, not_found
 from semdb.service.roles import ADMIN, READ
 from semdb.service.routing import AfterId, KeyframeId, Limit, MapName, Table
 from semdb.service.state import access_of, read, service_of
 
 table = Table("maps")
+_PICTURE = {"image/jpeg": {"schema": {"type": "string", "format": "binary"}}}
 Coordinate = Annotated[float | None, Query(ge=-1e7, le=1e7, allow_inf_nan=False, description="metres")]
 
 
@@ -221,21 +223,6 @@ async def list_loops(
     return page_of(request, later, most, lambda one: one[0], lambda one: values.link_dict(one[1]))
 
 
-@table.route("GET", "/v1/maps/{map}/queries", READ, schemas.Page[schemas.Query])
-async def list_queries(
-    request: Request,
-    map: MapName,
-    before: Annotated[int | None, Query(ge=1, le=2**63 - 1, description="key of an earlier page")] = None,
-    limit: Limit = None,
-) -> Response:
-    """What was localized in a map, the newest first."""
-    most = limit or service_of(request).settings.page
-    found = await read(request, lambda db: db.queries(map, before=before, limit=most + 1))
-    with_path = access_of(request).has(ADMIN)
-    shown = [(one.id, values.query_dict(one, with_path=with_path)) for one in found]
-    return page_of(request, shown, most, lambda one: one[0], lambda one: one[1], by="before")
-
-
 @table.route("GET", "/v1/maps/{map}/coverage", READ, schemas.CoverageModel)
 async def get_coverage(
     request: Request,
@@ -248,3 +235,21 @@ async def get_coverage(
     """How many keyframes are near a place, or at all, and where they look: whether localizing there can be expected."""
     where = place(x, y, z)
     return as_json((await read(request, lambda db: db.coverage(map, where, radius_m=radius))).as_dict())
+
+
+@table.route("GET", "/v1/maps/{map}/picture", READ, errors=(304,), only=_PICTURE)
+async def get_map_picture(
+    request: Request,
+    map: MapName,
+    width: Annotated[int, Query(ge=16, le=4096, description="pixels, at most")] = 480,
+) -> Response:
+    """A small picture of a map: the keyframe of it that shows most classes. 404 where it has no keyframe."""
+
+    def look(db: Database) -> bytes | None:
+        key = db.title_keyframe(map)
+        return None if key is None else small(db.keyframe_files(key).rgb, f"keyframe {key}", width)
+
+    found = await read(request, look)
+    if found is None:
+        raise not_found(f"picture of the map {map!r}: it has no keyframe")
+    return tagged(request, found, "image/jpeg", for_ever=False)

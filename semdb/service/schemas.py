@@ -228,6 +228,14 @@ class OtherPose(Model):
     inliers: int
 
 
+class MatchedModel(Model):
+    """Pixels of the image, and those of the best keyframe that they match; the pose rests on them."""
+
+    keyframe: int
+    query_xy: list[list[float]]
+    keyframe_xy: list[list[float]]
+
+
 class Answer(Model):
     """Where an image was taken. A pose for all but `failed`, which is an answer, too; `coarse` is good to 0.5 m."""
 
@@ -248,6 +256,7 @@ class Answer(Model):
     objects: list[SeenObject]
     notes: list[str] = Field(description="what was assumed")
     timing_ms: dict[str, float | None]
+    matches: MatchedModel | None = Field(None, description="where they were asked for")
 
 
 class BatchItem(Model):
@@ -292,6 +301,38 @@ class JobModel(Model):
     items: dict[str, int] | None = Field(description="keyframes by their state", examples=[{"done": 4, "pending": 2}])
     progress: dict[str, Any] | None = Field(examples=[{"what": "ingesting room", "done": 4, "total": 6}])
     error: str | None
+
+
+class Source(Model):
+    """What may be ingested: its `path` below one of the folders that are set."""
+
+    path: str = Field(examples=["rgbd_dataset_freiburg1_desk"])
+    kind: Literal["folder", "file"]
+    bytes: int | None
+
+
+class Sources(Model):
+    """What may be ingested by path. `paths`: whether any folder is set."""
+
+    paths: bool
+    entries: list[Source]
+    truncated: bool
+
+
+class Failure(Model):
+    """A keyframe that could not be stored."""
+
+    frame_index: int
+    attempts: int
+    error: str
+
+
+class Failures(Model):
+    """What could not be stored of a recording."""
+
+    map: str
+    recording: str
+    failures: list[Failure]
 
 
 class UploadModel(Model):
@@ -352,7 +393,7 @@ class Link(Model):
 
 
 class Query(Model):
-    """A localization that was logged."""
+    """A localization that was logged; `map` where one is asked for."""
 
     id: int
     created_at: str
@@ -386,10 +427,33 @@ class Rows(Model):
     truncated: bool
 
 
+class AboutTable(Model):
+    """What a table or view is for, and what its columns are."""
+
+    kind: Literal["table", "view"]
+    about: str
+    columns: dict[str, str]
+
+
 class Tables(Model):
-    """Columns by table or view."""
+    """Columns by table or view, and what those of the schema are for."""
 
     tables: dict[str, list[str]]
+    about: dict[str, AboutTable]
+
+
+class Question(Model):
+    """A statement of the cookbook."""
+
+    title: str
+    about: str
+    sql: str
+
+
+class Questions(Model):
+    """The statements of docs/sql.md."""
+
+    questions: list[Question]
 
 
 class Health(Model):

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from fastapi import Query, Request
@@ -93,7 +96,21 @@ def _csv(columns: list[str], rows: list[list[Any]]) -> str:
 
 @table.route("GET", "/v1/tables", READ, schemas.Tables)
 async def get_tables(request: Request) -> Response:
-    """Tables and views that statements can ask, with their columns."""
+    """Tables and views that statements can ask, with their columns, and what these are for."""
     for_all_maps(request)
     found = await read(request, lambda db: db.tables())
-    return as_json({"tables": {name: list(columns) for name, columns in found.items()}})
+    about = {name: text for name, text in page_texts()["tables"].items() if name in found}
+    return as_json({"tables": {name: list(columns) for name, columns in found.items()}, "about": about})
+
+
+@table.route("GET", "/v1/questions", READ, schemas.Questions)
+async def get_questions(request: Request) -> Response:
+    """Statements to begin with: those of the cookbook, docs/sql.md."""
+    return as_json({"questions": page_texts()["questions"]})
+
+
+@cache
+def page_texts() -> dict[str, Any]:
+    """What docs/schema.md and docs/sql.md say, as scripts/page_texts.py writes it."""
+    found: dict[str, Any] = json.loads((Path(__file__).parent / "page_texts.json").read_text("utf-8"))
+    return found

@@ -120,6 +120,18 @@ def answer_dict(answer: Answer, *, masks: bool = False, notes: Sequence[str] = (
     }
 
 
+def matches_dict(answer: Answer) -> dict[str, Any] | None:
+    """Which pixels of an image match which of the best keyframe; None where none was matched."""
+    found = answer.matches
+    if found is None:
+        return None
+    return {
+        "keyframe": found.keyframe_id,
+        "query_xy": np.round(found.query_xy, 2).tolist(),
+        "keyframe_xy": np.round(found.keyframe_xy, 2).tolist(),
+    }
+
+
 def keypoints_dict(keypoints: Keypoints, categories: Sequence[str]) -> dict[str, Any]:
     """Keypoints column by column, points in metres in the camera's frame, null where there is none."""
     features = keypoints.features
