@@ -9,12 +9,12 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from bench.trust.suites import HARD, NEGATIVE, POSITIVE, TEST, Asked, Query
 from semdb.evaluation.calibration import auroc, expected_calibration_error
 from semdb.evaluation.metrics import FALSE_ROTATION_DEG, FALSE_TRANSLATION_M
+from semdb.evaluation.uncertainty import POSITION, ROTATION, normalised_error, pose_offset
 from semdb.geometry import pose_error
 from semdb.localization.confidence import Evidence
 from semdb.localization.verdict import VerdictOptions, judge
@@ -112,13 +112,8 @@ def judged(row: Row) -> Row:
 
 def normalised_errors(estimate: FloatArray, truth: FloatArray, covariance: FloatArray) -> tuple[float, float, float]:
     """Normalised estimation error squared: of position and rotation together (6), of position (3), of rotation (3)."""
-    error = np.empty(6)
-    error[:3] = estimate[:3, 3] - truth[:3, 3]
-    error[3:] = Rotation.from_matrix(estimate[:3, :3] @ truth[:3, :3].T).as_rotvec()
-    parts = (slice(0, 6), slice(0, 3), slice(3, 6))
-    whole, position, rotation = (
-        float(error[p] @ np.linalg.pinv(covariance[p, p], hermitian=True) @ error[p]) for p in parts
-    )
+    error = pose_offset(estimate, truth)
+    whole, position, rotation = (normalised_error(error, covariance, p) for p in (slice(0, 6), POSITION, ROTATION))
     return whole, position, rotation
 
 

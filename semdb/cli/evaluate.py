@@ -74,6 +74,9 @@ def command(
     query_depth: Annotated[
         bool, typer.Option("--query-depth", help="Give the queries their depth images too, not the colour alone.")
     ] = False,
+    unrefined: Annotated[
+        bool, typer.Option("--unrefined", help="Leave the map as ingest makes it, without `semdb refine`.")
+    ] = False,
     truth: Annotated[
         str,
         typer.Option(
@@ -110,6 +113,7 @@ def command(
         camera=None if camera is None else parse_camera(camera),
         reading=reading,
         query_depth=query_depth,
+        refine=not unrefined,
         protocol=protocol,
         map_from=tuple(map_from or ()),
         query_from=tuple(query_from or ()),
@@ -266,6 +270,7 @@ def used_settings(settings: Settings, options: EvaluateOptions) -> dict[str, str
         "query depth": "yes" if options.query_depth else "no",
         "accepted": "-" if options.accept is None else f"{options.accept.metres:g} m, {options.accept.degrees:g} deg",
         "truth": options.truth,
+        "refined map": "yes" if options.refine else "no",
         "database": settings.database_url.partition(":")[0],
         "score threshold": number(settings.score_threshold),
         "keypoints per image": f"{settings.max_keypoints} at most",

@@ -17,6 +17,7 @@ from semdb.evaluation.calibration import (
 )
 from semdb.evaluation.metrics import EvaluationResult
 from semdb.evaluation.plots import LABEL_CHARACTERS, SERIES, style_axes
+from semdb.evaluation.uncertainty import held_shares
 from semdb.pictures.drawing import FAINT, INK
 from semdb.shown import for_legend
 from semdb.types import BoolArray, FloatArray
@@ -91,6 +92,31 @@ def confidence_plot(series: Sequence[tuple[str, FloatArray, BoolArray]]) -> Figu
         if axes.get_legend_handles_labels()[0]:
             where = {"loc": "upper left", "bbox_to_anchor": (0, -0.13)} if below else {"loc": place}
             axes.legend(**where, labelcolor=INK, framealpha=1.0, edgecolor="white", fontsize=9, markerscale=0.6)
+    return figure
+
+
+def uncertainty_plot(series: Sequence[tuple[str, Sequence[tuple[float, float]]]]) -> Figure:
+    """How many truths lie inside the ellipsoids that should hold a given share of them: position, and rotation.
+
+    `series` are (name, normalised errors squared of position and rotation of localized queries). Below the diagonal
+    covariances are too small, above it too large.
+    """
+    levels = np.linspace(0.02, 0.995, 60)
+    figure = Figure(figsize=(12.5, 5.2), layout="constrained")
+    for part, (axes, title) in enumerate(zip(figure.subplots(1, 2), ("position", "rotation"), strict=True)):
+        style_axes(axes)
+        axes.xaxis.set_major_formatter(PercentFormatter(1.0))
+        axes.yaxis.set_major_formatter(PercentFormatter(1.0))
+        axes.plot([0, 1], [0, 1], color=FAINT, lw=1.0, ls=(0, (4, 3)), zorder=1)
+        for i, (name, errors) in enumerate(series):
+            median = np.median([pair[part] for pair in errors])
+            label = f"{for_legend(name, LABEL_CHARACTERS)}: median NEES {median:.2f} (true: 2.37)"
+            axes.plot(levels, held_shares(errors, levels)[:, part], color=SERIES[i % len(SERIES)], lw=2.0, label=label)
+        axes.set_xlim(0, 1)
+        axes.set_ylim(0, 1.02)
+        axes.set_xlabel(f"{title}: share that the ellipsoid should hold")
+        axes.set_ylabel("share of true poses inside it")
+        axes.legend(loc="upper left", labelcolor=INK, framealpha=1.0, edgecolor="white", fontsize=9)
     return figure
 
 

@@ -48,6 +48,7 @@ def to_json(result: EvaluationResult) -> dict[str, Any]:
         "truth": result.truth,
         "other_errors": None if result.other_errors is None else asdict(result.other_errors),
         "disagreement": None if result.disagreement is None else asdict(result.disagreement),
+        "nees": None if result.nees is None else asdict(result.nees),
         "per_query": [_query_to_json(query) for query in result.per_query],
     }
 
@@ -162,6 +163,8 @@ def _query_to_json(query: QueryResult) -> dict[str, Any]:
         "sharpness": finite(query.sharpness),
         "other_translation_m": finite(query.other_translation_m),
         "other_rotation_deg": finite(query.other_rotation_deg),
+        "nees_position": None if query.nees is None else finite(query.nees[0]),
+        "nees_rotation": None if query.nees is None else finite(query.nees[1]),
     }
 
 

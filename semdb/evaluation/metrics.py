@@ -14,6 +14,7 @@ import numpy as np
 
 from semdb.evaluation.refined_truth import Disagreement
 from semdb.evaluation.retrieval import Reach, Retrieval, retrieval_figures
+from semdb.evaluation.uncertainty import POSITION, ROTATION, Nees, nees_figures, normalised_error, pose_offset
 from semdb.geometry import pose_error
 from semdb.types import FloatArray, Localization, ModelInfo, Verdict
 
@@ -39,8 +40,9 @@ class QueryResult:
     The errors are None where there is no pose (verdict `failed`) or no true pose; `other_*` are those against the
     other of two truths. `candidate` is the frame index of the best keyframe, in `candidate_recording`.
     `keyframe_in_reach`, `retrieval_rank` and `nearest_keyframe_*` are those of `semdb.evaluation.retrieval.Reach`;
-    `retrieves` is False for methods that are told their keyframes. The two poses ``[4, 4]`` are for plots and are
-    written to trajectories only.
+    `retrieves` is False for methods that are told their keyframes. `nees` is the normalised error squared of position
+    and of rotation, None where there is no pose, no covariance or no truth. The two poses ``[4, 4]`` and the covariance
+    ``[6, 6]`` are for plots and trajectories and not written elsewhere.
     """
 
     frame: str
@@ -67,6 +69,9 @@ class QueryResult:
     other_translation_m: float | None = None
     other_rotation_deg: float | None = None
     retrieves: bool = False
+    nees: tuple[float, float] | None = None
+    other_nees: tuple[float, float] | None = None
+    covariance: FloatArray | None = field(default=None, compare=False, repr=False)
     world_from_camera: FloatArray | None = field(default=None, compare=False, repr=False)
     true_world_from_camera: FloatArray | None = field(default=None, compare=False, repr=False)
 
@@ -105,6 +110,7 @@ class Errors:
     mean_translation_m: float | None
     mean_rotation_deg: float | None
     recall: Mapping[str, float | None]
+    nees: Nees | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,6 +152,7 @@ class EvaluationResult:
     truth: str = "given"
     other_errors: Errors | None = None
     disagreement: Disagreement | None = None
+    nees: Nees | None = None
     pictures: Mapping[tuple[str, int], bytes] = field(default_factory=dict, compare=False, repr=False)
 
 
@@ -164,10 +171,11 @@ def query_result(
     `timing_ms` (of stages that the localizer does not see, such as decode) is added to the localizer's own.
     The candidate is the one with most inliers, or none where nothing was matched.
     """
-    translation = rotation = None
-    estimate = localization.world_from_camera
+    translation = rotation = nees = None
+    estimate, covariance = localization.world_from_camera, localization.covariance
     if estimate is not None and true_world_from_camera is not None:
         translation, rotation = pose_error(estimate, true_world_from_camera)
+        nees = _nees(estimate, covariance, true_world_from_camera)
     matched = [candidate for candidate in localization.candidates if candidate.inliers > 0]
     best = max(matched, key=lambda candidate: candidate.inliers, default=None)
     if localization.best_keyframe_id is not None:
@@ -190,9 +198,18 @@ def query_result(
         recording=recording,
         timestamp_ns=timestamp_ns,
         candidate_recording=None if best is None else best.recording,
+        nees=nees,
+        covariance=covariance,
         world_from_camera=estimate,
         true_world_from_camera=true_world_from_camera,
     )
+
+
+def _nees(estimate: FloatArray, covariance: FloatArray | None, truth: FloatArray) -> tuple[float, float] | None:
+    if covariance is None:
+        return None
+    offset = pose_offset(estimate, truth)
+    return normalised_error(offset, covariance, POSITION), normalised_error(offset, covariance, ROTATION)
 
 
 def with_reach(query: QueryResult, found: Reach, *, retrieves: bool) -> QueryResult:
@@ -212,7 +229,8 @@ def with_other_truth(query: QueryResult, true_world_from_camera: FloatArray | No
     if true_world_from_camera is None or query.world_from_camera is None:
         return query
     metres, degrees = pose_error(query.world_from_camera, true_world_from_camera)
-    return replace(query, other_translation_m=metres, other_rotation_deg=degrees)
+    nees = _nees(query.world_from_camera, query.covariance, true_world_from_camera)
+    return replace(query, other_translation_m=metres, other_rotation_deg=degrees, other_nees=nees)
 
 
 def error_figures(queries: Sequence[QueryResult]) -> Errors:
@@ -227,6 +245,7 @@ def error_figures(queries: Sequence[QueryResult]) -> Errors:
         mean_translation_m=_mean(translations),
         mean_rotation_deg=_mean(rotations),
         recall={name: _recall(queries, limits) for name, limits in RECALL_LIMITS.items()},
+        nees=nees_figures([query.nees for query in localized if query.nees is not None]),
     )
 
 
@@ -248,7 +267,12 @@ def coarse_figures(queries: Sequence[QueryResult]) -> dict[str, float | None]:
 def other_error_figures(queries: Sequence[QueryResult]) -> Errors | None:
     """`error_figures` against the other truth, over the queries that it knows; None where it knows none."""
     swapped = [
-        replace(query, translation_m=query.other_translation_m, rotation_deg=query.other_rotation_deg)
+        replace(
+            query,
+            translation_m=query.other_translation_m,
+            rotation_deg=query.other_rotation_deg,
+            nees=query.other_nees,
+        )
         for query in queries
         if not query.is_localized or query.other_translation_m is not None
     ]
@@ -304,6 +328,7 @@ def summarise(
         else None,
         coarse=coarse_figures(results),
         other_errors=other_error_figures(results),
+        nees=errors.nees,
     )
 
 

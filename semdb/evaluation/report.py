@@ -11,7 +11,7 @@ from semdb.errors import UsageError
 from semdb.evaluation import html
 from semdb.evaluation.averages import averages
 from semdb.evaluation.comparisons import table_1, table_3, table_4
-from semdb.evaluation.confidence_plots import answers, confidence_plot, has_confidence
+from semdb.evaluation.confidence_plots import answers, confidence_plot, has_confidence, uncertainty_plot
 from semdb.evaluation.failures import explain, median_sharpness
 from semdb.evaluation.files import write_averages, write_json, write_queries_csv
 from semdb.evaluation.formats import NOTHING, errors, percent
@@ -201,7 +201,22 @@ def _optional(directory: Path, results: Sequence[EvaluationResult]) -> list[Sect
     chosen = [result for result in results if has_confidence(result)]
     if chosen:
         sections.append(("confidence", "Can the confidence be trusted?", _confidence(directory, chosen)))
+    chosen = [result for result in results if result.nees is not None]
+    if chosen:
+        sections.append(("uncertainty", "Can the covariance be trusted?", _uncertainty(directory, chosen)))
     return sections
+
+
+def _uncertainty(directory: Path, results: Sequence[EvaluationResult]) -> str:
+    """One picture per recording, as of the confidence."""
+    parts = [html.note("Localized queries against the true poses: on the diagonal covariances say what errors are.")]
+    for number, recording in enumerate(dict.fromkeys(result.recording for result in results), start=1):
+        chosen = [result for result in results if result.recording == recording]
+        errors = [[query.nees for query in result.per_query if query.is_localized and query.nees] for result in chosen]
+        figure = uncertainty_plot(list(zip(series_names(chosen), errors, strict=True)))
+        picture = _figure(directory / f"uncertainty-{number}.png", figure, f"covariances on {recording}")
+        parts += [f"<h3>{for_html(recording)}</h3>", picture]
+    return "\n".join(parts)
 
 
 def _confidence(directory: Path, results: Sequence[EvaluationResult]) -> str:

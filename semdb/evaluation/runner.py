@@ -35,9 +35,9 @@ Say = Callable[[str], None]
 class EvaluateOptions:
     """`query_depth` gives the queries of every method their depth images; otherwise a query is one colour image.
 
-    `keyframes` are numbers to run one by one, None for what the protocol chooses. `map_from` and `query_from` are
-    folders for protocol `split`. Poses within `accept` are one. `truth` is ``given``, ``refined`` or ``both``.
-    `pictures` is how many of the worst queries are drawn.
+    Without `refine` the map stays as ingest makes it. `keyframes` are numbers to run one by one, None for what the
+    protocol chooses. `map_from` and `query_from` are folders for protocol `split`. Poses within `accept` are one.
+    `truth` is ``given``, ``refined`` or ``both``. `pictures` is how many of the worst queries are drawn.
     """
 
     methods: tuple[str, ...] = (SEMDB,)
@@ -48,6 +48,7 @@ class EvaluateOptions:
     camera: Camera | None = None
     reading: ReadOptions = AS_THE_FORMAT_SAYS
     query_depth: bool = False
+    refine: bool = True
     protocol: str = PAPER
     map_from: tuple[Path, ...] = ()
     query_from: tuple[Path, ...] = ()
@@ -191,7 +192,10 @@ def _open(
     options: EvaluateOptions,
     progress: Progress | None,
 ) -> Run:
-    return open_run(method, task, describers, store, options.coarse, options.query_depth, progress, options.accept)
+    return open_run(
+        *(method, task, describers, store, options.coarse, options.query_depth, progress, options.accept),
+        refine=options.refine,
+    )
 
 
 def _answer(

@@ -209,6 +209,8 @@ def open_run(
     query_depth: bool,
     progress: Progress | None,
     accept: Tolerance | None = None,
+    *,
+    refine: bool = True,
 ) -> Run:
     """The method on the keyframes of `task`, which go into `store` unless another method brought them there."""
     if method.name in (SIFT_REFERENCE, COLMAP):
@@ -227,6 +229,9 @@ def open_run(
     map_name = describer.features.info.name  # one map per kind of features: rows of two kinds do not mix
     if all(info.name != map_name for info in store.maps()):
         _fill(map_name, task, describer, store, progress)
+        if refine:
+            kinds = (*FOR_LOCALIZATION, LANDMARKS)
+            refine_map(store, store.find_map(map_name), kinds=kinds, progress=progress)
     options = replace(method.options.with_threads(describers.settings.threads), accept=accept)
     info = store.find_map(map_name)
     if method.features is None:  # those that name their feature name their matching too
@@ -237,7 +242,7 @@ def open_run(
 
 
 def _fill(map_name: str, task: Task, describer: Describer, store: Store, progress: Progress | None) -> None:
-    """Keyframes into the map, and what `semdb refine` computes of them."""
+    """Keyframes into the map."""
     for part in task.keyframes:
         options = IngestOptions(map_name=map_name)
         summary = ingest_recording(
@@ -246,4 +251,3 @@ def _fill(map_name: str, task: Task, describer: Describer, store: Store, progres
         for entry in part.entries:
             if entry.index in summary.failed:
                 part.recording.note_decode_failure(entry, FrameError(summary.failed[entry.index]))
-    refine_map(store, store.find_map(map_name), kinds=(*FOR_LOCALIZATION, LANDMARKS), progress=progress)

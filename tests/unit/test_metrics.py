@@ -116,13 +116,13 @@ def test_json_has_exactly_the_contract_keys_and_no_nan() -> None:
         "false_localizations", "success_rate", "median_translation_m", "median_rotation_deg", "mean_translation_m",
         "mean_rotation_deg", "recall", "ranked_share", "keyframes_matched", "stages", "timing_ms", "per_query",
         "sequence", "keyframes_asked", "query_depth", "map_recordings", "query_recordings", "retrieval", "truth",
-        "coarse", "other_errors", "disagreement",
+        "coarse", "other_errors", "disagreement", "nees",
     }  # fmt: skip
     assert set(document["per_query"][0]) == {
         "frame", "frame_index", "verdict", "translation_m", "rotation_deg", "candidate", "inliers", "confidence",
         "stage", "ranked_share", "keyframes_matched", "timing_ms", "reason", "recording", "timestamp_ns",
         "candidate_recording", "keyframe_in_reach", "retrieval_rank", "nearest_keyframe_m", "nearest_keyframe_deg",
-        "sharpness", "other_translation_m", "other_rotation_deg",
+        "sharpness", "other_translation_m", "other_rotation_deg", "nees_position", "nees_rotation",
     }  # fmt: skip
     assert document["models"]["features"] == {"name": "sift", "sha256": "ab12", "config": {"nfeatures": 1500}}
     assert document["per_query"][0]["verdict"] == "localized"
