@@ -8,6 +8,21 @@ semdb_password() {
   esac
 }
 
+# All tables and views but the tokens and jobs of the service; CREATE lets rights be given before there is a table.
+semdb_readable() {
+  for table in \
+    alembic_version cameras categories class_confusions cnn_vectors descriptors ingest_items \
+    keyframe_categories keyframe_changes keyframe_images keyframes keypoints landmark_merges \
+    landmark_relations landmark_sightings landmark_views landmark_visits landmarks loop_closures \
+    map_gravity map_models maps models object_features objects planned_links planned_poses \
+    pose_covariances pose_operations pose_revisions pose_sources queries recording_findings recordings \
+    refined_points refinements keyframe_objects category_counts recording_summary covisible_objects \
+    keypoint_counts keyframe_links landmark_list landmark_relations_named landmark_visit_list; do
+    echo "GRANT CREATE, SELECT, SHOW VIEW ON \`semdb\`.\`$table\` TO 'semdb_reader'@'%';"
+    echo "REVOKE CREATE ON \`semdb\`.\`$table\` FROM 'semdb_reader'@'%';"
+  done
+}
+
 if semdb_password "$SEMDB_OWNER_PASSWORD" && semdb_password "$SEMDB_WRITER_PASSWORD" &&
   semdb_password "$SEMDB_READER_PASSWORD"; then
   MYSQL_PWD=$MYSQL_ROOT_PASSWORD mysql --protocol=socket --user=root <<SQL
@@ -17,7 +32,7 @@ GRANT SELECT, INSERT, UPDATE, DELETE, CREATE, ALTER, DROP, INDEX, REFERENCES, CR
 CREATE USER 'semdb_writer'@'%' IDENTIFIED BY '$SEMDB_WRITER_PASSWORD';
 GRANT SELECT, INSERT, UPDATE, DELETE ON semdb.* TO 'semdb_writer'@'%';
 CREATE USER 'semdb_reader'@'%' IDENTIFIED BY '$SEMDB_READER_PASSWORD';
-GRANT SELECT, SHOW VIEW ON semdb.* TO 'semdb_reader'@'%';
+$(semdb_readable)
 SQL
 else
   false

@@ -20,6 +20,7 @@ from semdb.cli.options import (
     reading_options,
     settings_options,
 )
+from semdb.cli.server import ServerOption, check_server, open_server
 
 if TYPE_CHECKING:
     from semdb.api import Answer, Database
@@ -65,16 +66,7 @@ def command(
         Path | None,
         typer.Option("--trajectory", metavar="FILE", help="Write the poses of a recording in TUM's format."),
     ] = None,
-    server: Annotated[
-        str | None,
-        typer.Option(
-            "--server",
-            metavar="URL",
-            envvar="SEMDB_SERVER",
-            show_envvar=False,
-            help="Ask the service there (semdb serve) instead of a database; over SEMDB_SERVER.",
-        ),
-    ] = None,
+    server: ServerOption = None,
     plot: Annotated[Path | None, typer.Option("--plot", metavar="DIR", help="Write a picture per image.")] = None,
     json: JsonFlag = False,
 ) -> None:
@@ -89,7 +81,7 @@ def command(
     groups = grouped(sources)
     check_options(groups, depth or [], query_depth, reading, trajectory)
     if server is not None:
-        check_server(server, overrides, plot)
+        check_server(server, overrides, {"--plot": plot is not None})
     if plot is not None:
         if plot.suffix.lower() in (".png", ".jpg", ".jpeg") and not plot.is_dir():
             raise UsageError(
@@ -163,29 +155,6 @@ def check_options(
             raise UsageError(f"{option} is for recordings, and none was given")
     if trajectory is not None and len(groups) != 1:
         raise UsageError("--trajectory is of one recording, or of the images of one folder: name one")
-
-
-def check_server(server: str, overrides: Overrides, plot: Path | None) -> None:
-    """Raises UsageError for options that are of a database, and not of a service."""
-    from dataclasses import fields
-
-    from semdb.errors import UsageError
-    from semdb.shown import for_terminal
-
-    where = f"with a service (--server or SEMDB_SERVER, {for_terminal(server)})"
-    for field in fields(overrides):
-        if getattr(overrides, field.name) is not None:
-            raise UsageError(f"--{field.name.replace('_', '-')} means nothing {where}: leave out one of them")
-    if plot is not None:
-        raise UsageError(f"--plot means nothing {where}: pictures are drawn from a database (--database-url)")
-
-
-def open_server(url: str) -> RemoteDatabase:
-    """The service that a command asks. Raises UsageError."""
-    from semdb.cli.progress import say
-    from semdb.client import connect
-
-    return connect(url, say=say)
 
 
 def check_one_world(database: Database | RemoteDatabase, map_name: str | None) -> None:

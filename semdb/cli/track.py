@@ -5,7 +5,7 @@ from __future__ import annotations
 import json as jsonlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -17,10 +17,12 @@ from semdb.cli.options import (
     reading_options,
     settings_options,
 )
+from semdb.cli.server import ServerOption, check_server, open_server
 from semdb.shown import measure
 
 if TYPE_CHECKING:
     from semdb.api import Database
+    from semdb.client import RemoteDatabase
     from semdb.door.tracked import Tracked
     from semdb.errors import FrameError
     from semdb.recordings import ReadOptions
@@ -60,6 +62,7 @@ def command(
         float | None,
         typer.Option("--rate", metavar="HZ", min=0.001, help="Frames a second of a folder of images; default 30."),
     ] = None,
+    server: ServerOption = None,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE", help="Write poses of tracked frames in TUM's format.")
     ] = None,
@@ -74,10 +77,13 @@ def command(
     """
     from semdb.cli.output import print_lines
 
+    if server is not None:
+        check_server(server, overrides, {"--smooth": smooth})
     unread: list[str] = []
     asked = Asked(map_name, like, camera, reading, every, query_depth, smooth, rate, unread)
     tally = Tally()
-    with open_database(overrides.settings()) as database, Output(out, json_lines) as output:
+    opened = open_server(server) if server is not None else open_database(overrides.settings())
+    with opened as database, Output(out, json_lines) as output:
         for answer in asked.answers(database, source, odometry):
             tally.add(answer)
             output.add(answer)
@@ -105,7 +111,7 @@ class Asked:
         self.map, self.like, self.camera, self.reading = map_name, like, camera, reading
         self.every, self.query_depth, self.smooth, self.rate, self.unread = every, query_depth, smooth, rate, unread
 
-    def answers(self, database: Database, source: Path, odometry: Path | None) -> Iterator[Tracked]:
+    def answers(self, database: Database | RemoteDatabase, source: Path, odometry: Path | None) -> Iterator[Tracked]:
         """One by one. Raises UsageError for options that mean nothing to the source."""
         from semdb.api.tracking import odometry_file
         from semdb.errors import UsageError
@@ -114,6 +120,7 @@ class Asked:
         if source.exists() and find_layout(source) is not None:
             if self.rate is not None:
                 raise UsageError("--rate is for folders of images; a recording has times")
+            options: dict[str, Any] = {"smooth": True} if self.smooth else {}
             yield from database.track_recording(
                 source,
                 map=self.map,
@@ -123,8 +130,8 @@ class Asked:
                 every=self.every,
                 query_depth=self.query_depth,
                 odometry=None if odometry is None else odometry_file(odometry),
-                smooth=self.smooth,
                 unreadable=self._unreadable,
+                **options,
             )
             return
         for option, given in (("--odometry", odometry is not None), ("--query-depth", self.query_depth)):
@@ -138,8 +145,10 @@ class Asked:
             raise not_a_recording(source)
         yield from self._each(database, frames)
 
-    def _each(self, database: Database, frames: Iterator[tuple[object, float, str]]) -> Iterator[Tracked]:
-        from semdb.api.tracking import smooth_answers
+    def _each(
+        self, database: Database | RemoteDatabase, frames: Iterator[tuple[object, float, str]]
+    ) -> Iterator[Tracked]:
+        from semdb.api.tracking import MapTracker, smooth_answers
         from semdb.errors import FrameError
 
         tracker = database.tracker(self.map, camera=self.camera, like=self.like, depth_scale=self.reading.depth_scale)
@@ -151,7 +160,7 @@ class Asked:
                 except FrameError as error:
                     self._unreadable(error)
 
-        yield from smooth_answers(answers(), tracker) if self.smooth else answers()
+        yield from smooth_answers(answers(), tracker) if isinstance(tracker, MapTracker) and self.smooth else answers()
 
     def _unreadable(self, error: FrameError) -> None:
         from semdb.cli.progress import say

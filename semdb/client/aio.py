@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Iterable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from semdb.client.writing import Writing
 
 if TYPE_CHECKING:
+    from semdb.client.tracking import RemoteTracker
     from semdb.database.records import Deleted, MapInfo, RecordingStatus
     from semdb.door.changed import Changes
     from semdb.door.found import Found
     from semdb.door.links import KeyframeLink
+    from semdb.door.tracked import Tracked
     from semdb.door.values import Answer, Keyframe, Rows
     from semdb.ingestion.run import IngestSummary
     from semdb.types import ModelInfo
@@ -21,6 +23,33 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 MOST_AT_ONCE = 32
 _END = object()
+
+
+class AsyncTracker:
+    """The methods of `RemoteTracker` as coroutines; for one task at a time."""
+
+    def __init__(self, tracker: RemoteTracker, run: Callable[..., Awaitable[Any]]) -> None:
+        self._tracker, self._run = tracker, run
+
+    @property
+    def map(self) -> str:
+        """The name of the map."""
+        return self._tracker.map
+
+    async def update(self, image: Any, **options: Any) -> Tracked:
+        """As `RemoteTracker.update`."""
+        found: Tracked = await self._run(self._tracker.update, image, **options)
+        return found
+
+    async def close(self) -> None:
+        """Lets the camera go."""
+        await self._run(self._tracker.close)
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
 
 
 class AsyncDatabase:
@@ -127,6 +156,14 @@ class AsyncDatabase:
     def localize_recording(self, recording: Any, **options: Any) -> AsyncIterator[Answer]:
         """As `RemoteDatabase.localize_recording`, for ``async for``."""
         return self._each(lambda: self.database.localize_recording(recording, **options))
+
+    async def tracker(self, map: str | None = None, **options: Any) -> AsyncTracker:
+        """As `RemoteDatabase.tracker`."""
+        return AsyncTracker(await self._run(self.database.tracker, map, **options), self._run)
+
+    def track_recording(self, recording: Any, **options: Any) -> AsyncIterator[Tracked]:
+        """As `RemoteDatabase.track_recording`, for ``async for``."""
+        return self._each(lambda: self.database.track_recording(recording, **options))
 
     async def ingest(self, source: Any, **options: Any) -> list[IngestSummary]:
         """As `RemoteDatabase.ingest`; `progress` is called in another thread."""

@@ -153,7 +153,7 @@ class Localizing(Reading):
         if every < 1:
             raise UsageError(f"every={every}: one frame in how many? From 1 on")
         reader = self._reader(map, None, None, None, ())
-        items = (partial(_read_frame, opened, entry, query_depth, reader) for entry in opened.entries[::every])
+        items = (partial(read_frame, opened, entry, query_depth, reader) for entry in opened.entries[::every])
         return self._answers(items, reader.tell, map, None, accept, log, masks, unreadable)
 
     def open_recording(
@@ -268,7 +268,7 @@ class Localizing(Reading):
         return answer_of(found, sent.name), found["notes"]
 
 
-def _read_frame(recording: Recording, entry: FrameEntry, with_depth: bool, reader: ImageReader) -> Sent:
+def read_frame(recording: Recording, entry: FrameEntry, with_depth: bool, reader: ImageReader) -> Sent:
     """One frame of a recording. Raises FrameError that names the file."""
     from semdb.types import Frame
 

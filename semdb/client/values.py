@@ -12,8 +12,10 @@ from semdb.database.records import MapInfo, RecordingState, RecordingStatus
 from semdb.door.changed import Changes, ComparedLandmark, Crop, LandmarkChange, Visited
 from semdb.door.found import Evidence, Found, FoundLandmark, Missing, Viewpoint
 from semdb.door.links import KeyframeLink
+from semdb.door.tracked import Tracked
 from semdb.door.values import Answer, Keyframe, KeyframeContent, SeenObject, frozen
 from semdb.errors import UsageError
+from semdb.tracking.states import TrackSource, TrackState
 from semdb.types import Camera, Candidate, ConsistentPose, Features, FloatArray, Keypoints, ModelInfo, Verdict
 
 Document = Mapping[str, Any]
@@ -124,6 +126,21 @@ def answer_of(found: Document, image: str) -> Answer:
         timing_ms={name: real(value) for name, value in found["timing_ms"].items()},
         frame_index=found["frame_index"],
         timestamp_ns=found["timestamp_ns"],
+    )
+
+
+def tracked_of(found: Document, name: str) -> Tracked:
+    """Where a moving camera is; `name` is what the image is called here."""
+    plain = ("time_s", "map", "inliers", "reason", "latency_ms", "confidence", "frame_index", "timestamp_ns")
+    return Tracked(
+        **{field: found[field] for field in plain},
+        image=name,
+        state=TrackState(found["state"]),
+        source=TrackSource(found["source"]),
+        world_from_camera=floats(found["world_from_camera"]),
+        covariance=floats(found["covariance"]),
+        map_from_odom=floats(found["map_from_odom_matrix"]),
+        smoothed=found["smoothed"],
     )
 
 

@@ -12,8 +12,8 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn
 
-from semdb.client.localizing import Localizing
 from semdb.client.problems import document_of, error_of
+from semdb.client.tracking import TrackingCameras
 from semdb.client.transport import segment
 from semdb.errors import RecordingError, UsageError
 from semdb.names import storable
@@ -22,9 +22,8 @@ if TYPE_CHECKING:
     from semdb.client.images import ImageReader
     from semdb.database.pose_records import PoseOperation
     from semdb.database.records import Deleted
-    from semdb.door.protocol import CameraTracker, Source
+    from semdb.door.protocol import Source
     from semdb.ingestion.run import IngestSummary
-    from semdb.localization.query_image import PathText
     from semdb.recordings.arrays import CameraLike
     from semdb.recordings.options import ReadOptions
     from semdb.refinement.align import AlignReport
@@ -39,7 +38,7 @@ OVER = frozenset(["done", "failed"])
 FRAME_NS = 33_333_333  # between frames that bring no times
 
 
-class Writing(Localizing):
+class Writing(TrackingCameras):
     """Ingests and deletes."""
 
     def close(self) -> None:
@@ -280,17 +279,6 @@ class Writing(Localizing):
     ) -> RecordedTrajectory:
         """Is for `semdb.open` only, which asks no database for it: raises UsageError."""
         self._not_here("trajectory")
-
-    def tracker(
-        self,
-        map: str | None = None,
-        *,
-        camera: CameraLike | None = None,
-        like: PathText | None = None,
-        depth_scale: float | None = None,
-    ) -> CameraTracker:
-        """Is for `semdb.open` only: raises UsageError."""
-        self._not_here("tracker")
 
     def align(
         self,

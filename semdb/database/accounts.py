@@ -13,6 +13,8 @@ from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
 from semdb.database import retry
 from semdb.database.engine import make_server_engine, parse_url
+from semdb.database.statement import HIDDEN
+from semdb.database.tables import metadata
 from semdb.errors import DatabaseError, UsageError
 
 ROLES = ("owner", "writer", "reader")
@@ -21,6 +23,12 @@ RIGHTS: Mapping[str, str] = {
     "writer": "SELECT, INSERT, UPDATE, DELETE",
     "reader": "SELECT, SHOW VIEW",
 }
+VIEWS = (
+    *("keyframe_objects", "category_counts", "recording_summary", "covisible_objects", "keypoint_counts"),
+    *("keyframe_links", "landmark_list", "landmark_relations_named", "landmark_visit_list"),
+)
+READABLE = ("alembic_version", *sorted(set(metadata.tables) - set(HIDDEN)), *VIEWS)
+"""What the reader may read: all but the tokens and jobs of the service."""
 _CANNOT_USER = 1396
 _LONGEST_SCHEMA = 32 - len("_writer")  # in names of accounts, of which MySQL takes 32 characters
 _CREATED = re.compile(r"CREATE USER (\S+) ")
@@ -44,12 +52,13 @@ def plan_accounts(
     host: str = "%",
     roles: Sequence[str] = ROLES,
     rotate: bool = False,
+    grants: bool = False,
 ) -> Accounts:
     """Accounts for the schema of `url`, of all roles or of `roles`; nothing is executed.
 
     `names` and `passwords` by role; a name that is not given is that of `account_name`, a password is made up. `host`
-    is where the accounts may connect from. With `rotate` they are there and get new passwords. Raises UsageError for
-    SQLite, which has no accounts, and for impossible names.
+    is where the accounts may connect from. With `rotate` they are there and get new passwords, with `grants` the rights
+    that they have in this version. Raises UsageError for SQLite, which has no accounts, and for impossible names.
     """
     parsed = parse_url(url)
     if parsed.get_backend_name() == "sqlite":
@@ -58,7 +67,7 @@ def plan_accounts(
         raise UsageError(f"{host!r} is no host for an account")
     schema = parsed.database or ""
     statements = []
-    if "owner" in roles and not rotate:
+    if "owner" in roles and not rotate and not grants:
         statements.append(
             f"CREATE DATABASE IF NOT EXISTS {_identifier(schema)} CHARACTER SET utf8mb4 COLLATE utf8mb4_bin"
         )
@@ -69,13 +78,31 @@ def plan_accounts(
         if not _NAME.fullmatch(name):
             raise UsageError(f"{name!r} cannot be the name of an account: 1 to 32 of A-Z a-z 0-9 _ . -")
         account = f"'{name}'@'{host}'"
-        statements.append(f"{'ALTER' if rotate else 'CREATE'} USER {account} IDENTIFIED BY {_quoted(password)}")
+        if not grants:
+            statements.append(f"{'ALTER' if rotate else 'CREATE'} USER {account} IDENTIFIED BY {_quoted(password)}")
         if not rotate:
-            # _ and % in the schema of a GRANT are patterns
-            pattern = _identifier(re.sub(r"([_%])", r"\\\1", schema))
-            statements.append(f"GRANT {RIGHTS[role]} ON {pattern}.* TO {account}")
+            statements += _grants(role, schema, account, there=grants)
+        if grants:
+            continue
         urls[role] = parsed.set(username=name, password=password).render_as_string(hide_password=False)
     return Accounts(tuple(statements), urls)
+
+
+def _grants(role: str, schema: str, account: str, *, there: bool) -> list[str]:
+    """The rights of an account; of one that is `there` those are taken that earlier versions gave it."""
+    # _ and % in the schema of a GRANT are patterns
+    pattern = _identifier(re.sub(r"([_%])", r"\\\1", schema))
+    whole = f"GRANT {RIGHTS[role]} ON {pattern}.* TO {account}"
+    if role != "reader":
+        return [whole]
+    # a right that is not there cannot be taken away, so it is given first
+    statements = [whole, f"REVOKE {RIGHTS[role]} ON {pattern}.* FROM {account}"] if there else []
+    for name in READABLE:
+        table = f"{_identifier(schema)}.{_identifier(name)}"
+        # rights on a table that is still to be made are given with that to make it alone
+        statements.append(f"GRANT CREATE, {RIGHTS[role]} ON {table} TO {account}")
+        statements.append(f"REVOKE CREATE ON {table} FROM {account}")
+    return statements
 
 
 def account_name(schema: str, role: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import signal
 import threading
 from collections.abc import AsyncIterator
@@ -67,7 +68,9 @@ def make_api(service: Service) -> FastAPI:
     async def life(_: FastAPI) -> AsyncIterator[None]:
         service.start_jobs()
         _hear_of_the_end(service)
+        forgetting = asyncio.create_task(_forget(service))
         yield
+        forgetting.cancel()
         service.close()
 
     app = FastAPI(
@@ -94,6 +97,13 @@ def make_api(service: Service) -> FastAPI:
     app.add_exception_handler(Exception, _on_anything)
     _document(app)
     return app
+
+
+async def _forget(service: Service) -> None:
+    """Lets cameras go of which nothing comes any more."""
+    while True:
+        await asyncio.sleep(min(5.0, service.settings.session_idle_s))
+        service.sessions.forget()
 
 
 def _hear_of_the_end(service: Service) -> None:

@@ -15,11 +15,11 @@ _SECONDS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 class Metrics:
     """Counters of one process."""
 
-    def __init__(self, queued: Callable[[], int] = int) -> None:
+    def __init__(self, queued: Callable[[], int] = int, cameras: Callable[[], int] = int) -> None:
         several = MULTIPROCESS in os.environ
         self._registry = CollectorRegistry()
         own = None if several else self._registry
-        self._queued = queued
+        self._queued, self._cameras = queued, cameras
         self.requests = Counter(
             "semdb_requests", "Requests by route and status", ("method", "route", "status"), registry=own
         )
@@ -27,6 +27,7 @@ class Metrics:
             "semdb_request_seconds", "Time of requests by route", ("route",), registry=own, buckets=_SECONDS
         )
         self.verdicts = Counter("semdb_localizations", "Localizations by map and verdict", ("verdict",), registry=own)
+        self.frames = Counter("semdb_tracked_frames", "Frames of sessions by state", ("state",), registry=own)
         if several:
             MultiProcessCollector(self._registry)
 
@@ -40,8 +41,13 @@ class Metrics:
         """Counts an answer."""
         self.verdicts.labels(name).inc()
 
+    def tracked(self, state: str) -> None:
+        """Counts a frame of a session."""
+        self.frames.labels(state).inc()
+
     def text(self) -> bytes:
         """What Prometheus reads."""
         text: bytes = generate_latest(self._registry)
         inside = f"# TYPE semdb_localizations_inside gauge\nsemdb_localizations_inside {self._queued()}\n"
-        return text + inside.encode()
+        cameras = f"# TYPE semdb_sessions gauge\nsemdb_sessions {self._cameras()}\n"
+        return text + inside.encode() + cameras.encode()

@@ -117,14 +117,16 @@ async def tell(scope: Scope, send: Send, problem: Problem, request_id: str, begu
     """Sends a problem; where an answer has begun, nothing can be said any more but that it ends here."""
     if begun:
         return
+    body, start = problem.body(request_id), "http.response"
     if scope["type"] == "websocket":
-        await send({"type": "websocket.close", "code": 1008, "reason": problem.detail[:100]})
-        return
-    body = problem.body(request_id)
+        if "websocket.http.response" not in scope.get("extensions", {}):
+            await send({"type": "websocket.close", "code": 1008, "reason": problem.detail[:100]})
+            return
+        start = "websocket.http.response"
     headers = [(b"content-type", MEDIA_TYPE.encode()), (b"content-length", str(len(body)).encode())]
     headers += [(name.lower().encode(), value.encode("latin-1", "replace")) for name, value in problem.headers.items()]
-    await send({"type": "http.response.start", "status": problem.status, "headers": headers})
-    await send({"type": "http.response.body", "body": b"" if scope["method"] == "HEAD" else body})
+    await send({"type": f"{start}.start", "status": problem.status, "headers": headers})
+    await send({"type": f"{start}.body", "body": b"" if scope.get("method") == "HEAD" else body})
 
 
 def header(scope: Scope, name: bytes) -> str:

@@ -1,18 +1,20 @@
-"""Sessions: a camera that asks again and again, by plain HTTP or over one connection.
+"""Sessions: a camera that is tracked frame after frame, by plain HTTP or over one connection.
 
-What a session is stands in its id, signed, so that any process of any service with the same secret answers it. Each
-frame is localized by itself: the library has no way yet to be told where the camera was a moment ago.
+What the frames have in common stands in the id of the session, signed, so that any process of any service with the same
+secret can go on with it. Where the camera was a moment ago only the process knows that had the frames before; one that
+has not looks for the camera in the whole map, and says so.
 """
 
 from __future__ import annotations
 
 import asyncio
 import json
+import secrets
 import time
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from typing import Annotated, Any
 
-from fastapi import Body, FastAPI, Request, WebSocket
+from fastapi import Body, FastAPI, Form, Request, WebSocket
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import Response
 from starlette.websockets import WebSocketDisconnect
@@ -21,19 +23,39 @@ from semdb.errors import SemdbError
 from semdb.service import schemas
 from semdb.service.access import admit
 from semdb.service.answers import as_json, encoded
-from semdb.service.localize_routes import Files, FrameIndex, Given, Name, Query, Timestamp, answered, work_of
+from semdb.service.localize_routes import (
+    CameraText,
+    Categories,
+    DepthScale,
+    Files,
+    FrameIndex,
+    Name,
+    Timestamp,
+    check_pixels,
+)
 from semdb.service.middleware import check_depth, tell
-from semdb.service.problems import Problem, not_found, problem_of
+from semdb.service.problems import Problem, busy, not_found, problem_of
 from semdb.service.roles import LOCALIZE
 from semdb.service.routing import MapName, Table
 from semdb.service.signing import opened, signed
-from semdb.service.state import access_of, service_of
+from semdb.service.state import Service, access_of, gone, service_of
+from semdb.service.tracked import Common, FrameGiven, numbers_of, open_tracker, pose_of, track
 
 table = Table("sessions")
 KIND = "session"
 STREAM = "/v1/sessions/{session}/stream"
 PARTS = ("image", "depth", "instances")
-_OF_A_FRAME = ("frame_index", "timestamp_ns")
+LATEST_S = 1e12
+_WHOLE = ("frame_index", "timestamp_ns")
+_REAL = ("time_s", "depth_scale")
+TimeS = Annotated[
+    float | None,
+    Form(ge=-LATEST_S, le=LATEST_S, allow_inf_nan=False, description="seconds of a clock that only goes forwards"),
+]
+Odometry = Annotated[
+    str | None,
+    Form(max_length=1000, description="odom_from_camera: x,y,z,qw,qx,qy,qz, or a matrix of 16 numbers row by row"),
+]
 
 
 class NewSession(BaseModel):
@@ -45,59 +67,99 @@ class NewSession(BaseModel):
     like: str | None = Field(None, max_length=255)
     depth_scale: float | None = Field(None, allow_inf_nan=False)
     categories: dict[str, str] | None = Field(None, max_length=1000)
-    masks: bool = False
-    log: bool = True
 
 
-@table.route("POST", "/v1/maps/{map}/sessions", LOCALIZE, schemas.Session, status=201, errors=(404,))
+@table.route("POST", "/v1/maps/{map}/sessions", LOCALIZE, schemas.Session, status=201, errors=(404, 409))
 async def open_session(
     request: Request, map: MapName, body: Annotated[NewSession, Body(default_factory=NewSession)]
 ) -> Response:
-    """Opens a session: what its frames have in common is said once."""
+    """Begins to track a camera in a map: what its frames have in common is said once."""
     service = service_of(request)
-    await service.reading.run(lambda: service.database.map(map))
     texts = None if body.categories is None else json.dumps(body.categories)
-    query = Query(map, body.camera, body.like, body.depth_scale, body.masks, body.log, texts)
+    who = access_of(request).who
+    common = Common(secrets.token_hex(8), who, map, body.camera, body.like, body.depth_scale, texts)
+    async with service.sessions.use(common.id) as live:
+        await service.localizing.run(lambda: open_tracker(service.database, live, common), lambda: gone(request))
+        live.opened = True
     seconds = service.settings.session_hours * 3600
-    name = signed(service.secret, KIND, {k: v for k, v in asdict(query).items() if k not in _OF_A_FRAME}, seconds)
+    name = signed(service.secret, KIND, asdict(common), seconds)
     address = f"/v1/sessions/{name}"
     content = {
         "session": name,
         "map": map,
         "seconds": int(seconds),
+        "idle_seconds": service.settings.session_idle_s,
         "frames": f"{address}/frames",
         "stream": f"{address}/stream",
-        "tracking": False,
+        "tracking": True,
     }
     return as_json(content, 201)
 
 
-@table.route("POST", "/v1/sessions/{session}/frames", LOCALIZE, schemas.Answer, errors=(404, 409))
-async def localize_frame(
+@table.route("POST", "/v1/sessions/{session}/frames", LOCALIZE, schemas.Tracked, errors=(404, 409))
+async def track_frame(
     request: Request,
     session: str,
     given: Files,
     name: Name = None,
+    time_s: TimeS = None,
     frame_index: FrameIndex = None,
     timestamp_ns: Timestamp = None,
+    camera: CameraText = None,
+    depth_scale: DepthScale = None,
+    categories: Categories = None,
+    odometry: Odometry = None,
 ) -> Response:
-    """Where a frame of a session was taken."""
-    query = _query(request, session, frame_index, timestamp_ns)
-    return as_json(await answered(request, query, given, name))
+    """Where the camera of a session is now. A frame that is sent once more gets its answer once more."""
+    common = _common(request, session)
+    frame = FrameGiven(
+        image=given.image,
+        depth=given.depth,
+        instances=given.instances,
+        categories=categories or None,
+        camera=camera or None,
+        depth_scale=depth_scale,
+        name=name,
+        time_s=time_s,
+        frame_index=frame_index,
+        timestamp_ns=timestamp_ns,
+        odometry=None if not odometry else pose_of(numbers_of(odometry)),
+    )
+    service = service_of(request)
+    _check(service, frame)
+    async with service.sessions.use(common.id) as live:
+        answer = await service.localizing.run(
+            lambda: track(service.database, live, common, frame), lambda: gone(request)
+        )
+    service.metrics.tracked(answer["state"])
+    return as_json(answer)
 
 
-def _query(
-    connection: Request | WebSocket, session: str, frame_index: int | None = None, timestamp_ns: int | None = None
-) -> Query:
-    """What frames of a session ask. Raises Problem 404 for one that is none, 403 for one of a map of others."""
+@table.route("DELETE", "/v1/sessions/{session}", LOCALIZE, schemas.Ended)
+async def end_session(request: Request, session: str) -> Response:
+    """Lets a camera go, so that there is a place for another one; one that sends nothing is let go by itself."""
+    service_of(request).sessions.end(_common(request, session).id)
+    return as_json({"ended": True})
+
+
+def _common(connection: Request | WebSocket, session: str) -> Common:
+    """What frames of a session have in common. Raises Problem 404 for one that is none or of somebody else, 403."""
     found = opened(connection.app.state.service.secret, KIND, session)
-    if found is None:
+    access = connection.state.access
+    if found is None or found["who"] != access.who:
         raise not_found("session of that name: it ended, or another service made it (SEMDB_SERVE_SECRET)")
-    known = {field.name for field in fields(Query)}
-    query = Query(**{k: v for k, v in found.items() if k in known}, frame_index=frame_index, timestamp_ns=timestamp_ns)
-    if query.map is not None and not connection.state.access.sees(query.map):
-        raise Problem(403, f"this token is not for the map {query.map!r}")
-    return query
+    common = Common(**found)
+    if not access.sees(common.map):
+        raise Problem(403, f"this token is not for the map {common.map!r}")
+    return common
+
+
+def _check(service: Service, frame: FrameGiven) -> None:
+    """Raises Problem 413 for an image that would be too large once it is decoded, FrameError for what is none."""
+    parts = (("image", frame.image), ("depth image", frame.depth), ("image of instances", frame.instances))
+    for what, data in parts:
+        if data is not None:
+            check_pixels(data, f"the {what}", service.settings.max_pixels)
 
 
 async def stream(socket: WebSocket) -> None:
@@ -107,17 +169,19 @@ async def stream(socket: WebSocket) -> None:
     the next one may come.
     """
     request_id = str(socket.scope["state"]["request_id"])
-    service = socket.app.state.service
+    service: Service = socket.app.state.service
     try:
         await admit(socket, LOCALIZE)
-        _query(socket, socket.path_params["session"])
+        _common(socket, socket.path_params["session"])
+        if len(service.sockets) >= service.settings.sessions:
+            raise busy("all places for connections are taken", service.settings.session_idle_s / 4)
     except (Problem, SemdbError) as error:
         problem = error if isinstance(error, Problem) else problem_of(error)
         await tell(socket.scope, socket._send, problem, request_id)
         return
-    await socket.accept()
     service.sockets.add(socket)
     try:
+        await socket.accept()
         await _frames(socket, request_id)
     except (WebSocketDisconnect, asyncio.CancelledError):
         pass
@@ -130,7 +194,7 @@ async def stream(socket: WebSocket) -> None:
 
 
 async def _frames(socket: WebSocket, request_id: str) -> None:
-    service = socket.app.state.service
+    service: Service = socket.app.state.service
     idle = service.settings.session_idle_s
     sequence = 0
     while not service.stopping:
@@ -138,10 +202,7 @@ async def _frames(socket: WebSocket, request_id: str) -> None:
         started = time.perf_counter()
         try:
             await admit(socket, LOCALIZE)  # a token may have been revoked since
-            query = _query(socket, socket.path_params["session"], said.get("frame_index"), said.get("timestamp_ns"))
-            name = str(said.get("name") or "image")[:255]
-            work = work_of(service, access_of(socket), query, Given(**files), name)
-            answer: dict[str, Any] = await service.localizing.run(work)
+            answer = await _answered(service, _common(socket, socket.path_params["session"]), said, files)
         except (Problem, SemdbError) as error:
             problem = error if isinstance(error, Problem) else problem_of(error)
             if problem.status in (401, 403, 404):
@@ -150,6 +211,29 @@ async def _frames(socket: WebSocket, request_id: str) -> None:
         sequence += 1
         answer |= {"sequence": sequence, "ms": round(1000 * (time.perf_counter() - started), 3)}
         await asyncio.wait_for(socket.send_text(encoded(answer).decode()), service.settings.body_timeout_s)
+
+
+async def _answered(service: Service, common: Common, said: dict[str, Any], files: dict[str, bytes]) -> dict[str, Any]:
+    odometry = said.get("odometry")
+    categories = said.get("categories")
+    frame = FrameGiven(
+        image=files["image"],
+        depth=files.get("depth"),
+        instances=files.get("instances"),
+        categories=None if categories is None else json.dumps(categories),
+        camera=said.get("camera"),
+        depth_scale=said.get("depth_scale"),
+        name=None if said.get("name") is None else str(said["name"])[:255],
+        time_s=said.get("time_s"),
+        frame_index=said.get("frame_index"),
+        timestamp_ns=said.get("timestamp_ns"),
+        odometry=None if odometry is None else pose_of([float(number) for number in odometry]),
+    )
+    _check(service, frame)
+    async with service.sessions.use(common.id) as live:
+        answer = await service.localizing.run(lambda: track(service.database, live, common, frame))
+    service.metrics.tracked(answer["state"])
+    return dict(answer)
 
 
 async def _message(socket: WebSocket) -> tuple[dict[str, Any], dict[str, bytes]]:
@@ -178,14 +262,32 @@ def _said(text: str) -> dict[str, Any]:
         said = json.loads(text)
     except ValueError:
         said = None
-    parts = said.get("parts", ["image"]) if isinstance(said, dict) else None
-    whole = isinstance(said, dict) and all(
-        said.get(key) is None or (isinstance(said[key], int) and abs(said[key]) < 2**63) for key in _OF_A_FRAME
-    )
-    good = isinstance(parts, list) and "image" in parts and len(set(map(str, parts))) == len(parts)
-    if not whole or not good or not set(parts or ()) <= set(PARTS) or not isinstance(said, dict):
+    if not isinstance(said, dict) or not _good(said):
         raise Problem(422, 'the text is expected as JSON: {"parts": ["image", "depth"], "timestamp_ns": 1}')
     return said
+
+
+def _good(said: dict[str, Any]) -> bool:
+    """Whether all that is said of a frame is of its kind."""
+
+    def number(value: object, whole: bool = False) -> bool:
+        kinds = int if whole else int | float
+        return isinstance(value, kinds) and not isinstance(value, bool) and abs(value) < (2**63 if whole else LATEST_S)
+
+    parts = said.get("parts", ["image"])
+    texts = said.get("categories")
+    odometry = said.get("odometry")
+    return (
+        isinstance(parts, list)
+        and "image" in parts
+        and all(isinstance(part, str) and part in PARTS for part in parts)
+        and len(set(parts)) == len(parts)
+        and all(said.get(name) is None or number(said[name], whole=True) for name in _WHOLE)
+        and all(said.get(name) is None or number(said[name]) for name in _REAL)
+        and (said.get("camera") is None or (isinstance(said["camera"], str) and len(said["camera"]) <= 400))
+        and (texts is None or (isinstance(texts, dict) and all(isinstance(text, str) for text in texts.values())))
+        and (odometry is None or (isinstance(odometry, list) and all(map(number, odometry))))
+    )
 
 
 async def _received(socket: WebSocket) -> str | bytes:

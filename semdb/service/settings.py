@@ -47,7 +47,10 @@ class ServeSettings(BaseSettings):
     sql_mb: float = Field(16.0, gt=0, description="largest answer of a statement, MiB; more rows are left out")
     body_timeout_s: float = Field(30.0, gt=0, description="a client that sends or takes nothing for so long is let go")
     request_timeout_s: float = Field(600.0, gt=0, description="the longest that a body may take to come")
-    session_idle_s: float = Field(60.0, gt=0, description="a connection of a session on which nothing comes ends")
+    sessions: int = Field(64, ge=1, le=10_000, description="cameras tracked at once by a process; more: 429")
+    session_idle_s: float = Field(
+        60.0, gt=0, description="a session of which nothing comes for so long lets its camera go"
+    )
     session_hours: float = Field(12.0, gt=0, le=24 * 366, description="a session ends after so long")
     stop_timeout_s: float = Field(30.0, gt=0, description="what runs may take so long to end when the service stops")
     ingest_roots: str | None = Field(

@@ -13,6 +13,7 @@ from starlette.requests import HTTPConnection, Request
 from starlette.websockets import WebSocket
 
 from semdb.api import Database
+from semdb.service.cameras import Sessions
 from semdb.service.ingesting import Jobs, ingest_settings
 from semdb.service.metrics import Metrics
 from semdb.service.pool import Pool
@@ -54,6 +55,7 @@ class Service:
     localizing: Pool = field(init=False)
     statements: Pool = field(init=False)
     writing: Pool = field(init=False)
+    sessions: Sessions = field(init=False)
     sockets: set[WebSocket] = field(default_factory=set)
     rates: Rates = field(init=False)
     secret: bytes = field(init=False, repr=False)
@@ -71,7 +73,8 @@ class Service:
         self.rates = Rates(self.settings.rate, self.settings.burst)
         folder = self.settings.uploads or self.database.settings.cache_dir / "serve" / "uploads"
         self.uploads = Uploads(folder.expanduser().absolute(), int(self.settings.max_unpacked_mb * MIB))
-        self.metrics = Metrics(lambda: self.localizing.inside)
+        self.sessions = Sessions(self.settings.sessions, self.settings.session_idle_s)
+        self.metrics = Metrics(lambda: self.localizing.inside, lambda: len(self.sessions))
         self.secret = (self.settings.secret or secrets.token_hex(32)).encode()
 
     def answered(self, verdict: str) -> None:

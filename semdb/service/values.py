@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from semdb.database.records import MapInfo, RecordingStatus
     from semdb.door.found import Found
     from semdb.door.links import KeyframeLink
+    from semdb.door.tracked import Tracked
     from semdb.door.values import Answer, Keyframe, SeenObject
 
 
@@ -129,6 +130,17 @@ def matches_dict(answer: Answer) -> dict[str, Any] | None:
         "keyframe": found.keyframe_id,
         "query_xy": np.round(found.query_xy, 2).tolist(),
         "keyframe_xy": np.round(found.keyframe_xy, 2).tolist(),
+    }
+
+
+def tracked_dict(answer: Tracked, *, notes: Sequence[str] = ()) -> dict[str, Any]:
+    """What ``semdb track --json-lines`` prints for a frame, with poses as matrices, too, and what was assumed."""
+    pose, corrected = answer.world_from_camera, answer.map_from_odom
+    return {
+        **answer.as_dict(),
+        "world_from_camera": None if pose is None else pose.tolist(),
+        "map_from_odom_matrix": None if corrected is None else corrected.tolist(),
+        "notes": list(notes),
     }
 
 

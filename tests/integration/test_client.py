@@ -8,6 +8,7 @@ import shutil
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import pytest
 
 import semdb
 from semdb.api import Answer, Database
+from semdb.door.tracked import Tracked
 from semdb.door.values import Keyframe, SeenObject
 from semdb.errors import DatabaseError, FrameError, NotFoundError, UsageError
 from semdb.service.settings import ServeSettings
@@ -104,6 +106,59 @@ def test_images_files_and_frames(
     assert db.localize(frames[6], map="office", masks=False).objects[0].size == (0, 0)
     with pytest.raises(ValueError, match="no picture"):
         found.picture()
+
+
+def same_tracks(found: list[Tracked], wanted: list[Tracked]) -> bool:
+    def bits(one: Tracked) -> Any:
+        arrays = (one.world_from_camera, one.covariance, one.map_from_odom)
+        return [None if array is None else array.tobytes() for array in arrays], replace(
+            one, world_from_camera=None, covariance=None, map_from_odom=None, latency_ms=0.0
+        )
+
+    plain = [
+        [name for name in Tracked.__slots__ if getattr(bits(a)[1], name) != getattr(bits(b)[1], name)]
+        for a, b in zip(found, wanted, strict=True)
+    ]
+    assert plain == [[]] * len(found)
+    return [bits(one)[0] for one in found] == [bits(one)[0] for one in wanted]
+
+
+def test_cameras_are_tracked(served: Served, db: semdb.RemoteDatabase, frames: list[Frame], room: Path) -> None:
+    own = served.database
+    odometry = [None if number == 1 else frame.world_from_camera for number, frame in enumerate(frames[5:11])]
+
+    def tracked(base: Any, shown: list[Any], **options: Any) -> list[Tracked]:
+        tracker = base.tracker(**options)
+        return [
+            tracker.update(one, odometry=known, time_s=0.1 * number)
+            for number, (one, known) in enumerate(zip(shown, odometry[: len(shown)], strict=True))
+        ]
+
+    shown: list[Any] = list(frames[5:11])
+    found = tracked(db, shown, map="office")
+    assert same_tracks(found, tracked(own, shown, map="office"))
+    assert [str(one.state) for one in found][-3:] == ["tracking"] * 3
+    pictures = [frame.image for frame in shown[:3]]
+    numbers = {"map": "a/b", "camera": frames[0].camera}
+    assert same_tracks(tracked(db, pictures, **numbers), tracked(own, pictures, **numbers))
+    like = {"map": "a/b", "like": "stairs"}
+    assert same_tracks(tracked(db, pictures, **like), tracked(own, pictures, **like))
+    with db.tracker("a/b") as one, pytest.raises(UsageError, match="rigid pose"):
+        one.update(pictures[0], odometry=np.zeros((3, 3)))
+    asked: dict[str, Any] = {"map": "office", "every": 4, "query_depth": True}
+    assert same_tracks(list(db.track_recording(room, **asked)), list(own.track_recording(room, **asked)))
+    with db.tracker("office") as one:
+        one.update(frames[5])
+        served.service.sessions._live.clear()  # as after a minute, or of another process
+        late = one.update(frames[6])
+        assert (str(late.source), late.map) == ("relocalised", "office")
+        served.service.secret = b"another one, as after a restart"
+        assert str(one.update(frames[7]).source) == "relocalised"
+    for ask in (lambda base: base.tracker("attic"), lambda base: base.tracker(), lambda base: base.tracker(like="x")):
+        with pytest.raises(semdb.SemdbError) as local:
+            ask(own)
+        with pytest.raises(type(local.value)):
+            ask(db)
 
 
 def test_recordings(served: Served, db: semdb.RemoteDatabase, room: Path) -> None:
@@ -226,6 +281,8 @@ def test_asyncio(served: Served, frames: list[Frame]) -> None:
             keyframe = await db.load(keyframes[0], "image")
             assert list(keyframe.kept) == ["image"]
             images = [frames[0].image, frames[13].image]
+            async with await db.tracker("office") as tracker:
+                assert (tracker.map, (await tracker.update(frames[6])).image) == ("office", frames[6].name)
             names = [one.image async for one in db.localize_each(images, map="a/b")]
             assert names == ["image 0", "image 1"]
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from sqlalchemy import text
 from sqlalchemy.engine import make_url
+from sqlalchemy.exc import SQLAlchemyError
 
 from semdb.database import accounts, schema
 from semdb.database.catalogue import ask, tables_and_columns
@@ -315,6 +316,42 @@ def test_each_account_can_do_its_work_and_no_more(database_server: TestServer, s
         database_server.execute(*(f"DROP USER IF EXISTS '{name}'@'%'" for name in names.values()))
 
 
+def test_the_reader_cannot_read_tokens(database_server: TestServer, server_url: str) -> None:
+    """Neither one that is made now, before the schema is, nor one that could, once it gets this version's rights."""
+    name = str(make_url(server_url).database)
+    account = f"'{accounts.account_name(name, 'reader')}'@'%'"
+    made = accounts.plan_accounts(server_url, roles=("reader",))
+    accounts.execute(server_url, made.statements)
+
+    def seen() -> set[str]:
+        engine = make_engine(made.urls["reader"])
+        with engine.connect() as connection:
+            found = {row[0] for row in connection.exec_driver_sql("SHOW TABLES")}
+            for table in sorted(found):
+                connection.exec_driver_sql(f"SELECT 1 FROM `{table}` LIMIT 1")
+            connection.exec_driver_sql("SHOW CREATE VIEW keyframe_objects")
+        engine.dispose()
+        return found
+
+    try:
+        schema.upgrade(make_engine(server_url))
+        there = {row[0] for row in database_server.execute(f"SHOW TABLES IN `{name}`")}
+        assert seen() == there - {"access_tokens", "service_jobs"}
+        for refused in ("SELECT hash FROM access_tokens", "CREATE TABLE mine (a INT)", "DROP TABLE maps"):
+            with pytest.raises(SQLAlchemyError), make_engine(made.urls["reader"]).connect() as connection:
+                connection.exec_driver_sql(refused)
+        whole = name.replace("_", "\\_")  # as earlier versions did it
+        database_server.execute(f"GRANT SELECT, SHOW VIEW ON `{whole}`.* TO {account}")
+        assert "access_tokens" in seen()
+        accounts.execute(server_url, accounts.plan_accounts(server_url, roles=("reader",), grants=True).statements)
+        assert seen() == there - {"access_tokens", "service_jobs"}
+        with make_engine(made.urls["reader"]).connect() as connection:
+            grants = [str(row[0]) for row in connection.exec_driver_sql("SHOW GRANTS")]
+        assert [right for grant in grants for right in excess_rights(grant)] == []
+    finally:
+        database_server.execute(f"DROP USER IF EXISTS {account}")
+
+
 def test_accounts_that_cannot_be_made(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="SQLite has no accounts"):
         accounts.plan_accounts(f"sqlite:///{tmp_path / 'a.sqlite3'}")
@@ -327,7 +364,12 @@ def test_accounts_that_cannot_be_made(tmp_path: Path) -> None:
         accounts.plan_accounts(url, passwords={"owner": "a\\"})
     made = accounts.plan_accounts(url, passwords=dict.fromkeys(accounts.ROLES, "p'w"))
     assert made.statements[1] == "CREATE USER 'semdb_owner'@'%' IDENTIFIED BY 'p''w'"
-    assert made.statements[-1] == "GRANT SELECT, SHOW VIEW ON `semdb`.* TO 'semdb_reader'@'%'"
+    assert made.statements[-1] == "REVOKE CREATE ON `semdb`.`landmark_visit_list` FROM 'semdb_reader'@'%'"
+    assert not any("access_tokens" in statement or "service_jobs" in statement for statement in made.statements)
+    again = accounts.plan_accounts(url, roles=("reader",), grants=True)
+    assert again.statements[0] == "GRANT SELECT, SHOW VIEW ON `semdb`.* TO 'semdb_reader'@'%'"
+    assert again.statements[1] == "REVOKE SELECT, SHOW VIEW ON `semdb`.* FROM 'semdb_reader'@'%'"
+    assert again.urls == {}
 
 
 @pytest.mark.parametrize(

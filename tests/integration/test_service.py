@@ -227,38 +227,103 @@ def test_the_document_names_every_route(served: Served, get: Any) -> None:
     assert {"/v1/maps/{map}/localize", "/v1/sql", "/v1/keyframes/{keyframe}/mask"} <= set(document["paths"])
 
 
-def test_a_session_by_http_and_over_a_connection(served: Served, frames: list[Frame]) -> None:
-    form, files = form_of(frames[6])
-    common = {"camera": form["camera"], "categories": json.loads(form["categories"]), "log": False}
+def tracked(answer: dict[str, Any]) -> str:
+    kept = {name: value for name, value in answer.items() if name not in ("latency_ms", "notes", "frames")}
+    return json.dumps(kept)
+
+
+def test_a_camera_is_tracked_as_by_the_library(served: Served, frames: list[Frame]) -> None:
+    shown = [replace(frame, depth=None) for frame in frames[5:10]]
+    odometry = [np.array(frame.world_from_camera) for frame in shown]
+    tracker = served.database.tracker("office")
+    wanted = []
+    for frame, known in zip(shown, odometry, strict=True):
+        own = tracker.update(frame, odometry=known, name="frame")
+        found = json.loads(json.dumps(to_jsonable(values.tracked_dict(own))))
+        wanted.append(tracked(found))
+    assert [json.loads(one)["state"] for one in wanted][-3:] == ["tracking"] * 3
+    form, _ = form_of(shown[0])
+    common = {"categories": json.loads(form["categories"])}
     opened = served.client.post("/v1/maps/office/sessions", json=common)
-    assert (opened.status_code, opened.json()["tracking"]) == (201, False), opened.text
-    wanted = untimed(as_sent(served.database.localize(replace(frames[6], depth=None), map="office", name="frame")))
-    sent = {name: form[name] for name in ("name", "frame_index", "timestamp_ns")}
-    assert untimed(served.client.post(opened.json()["frames"], data=sent, files=files).json()) == wanted
-    address = f"ws{served.url.removeprefix('http')}{opened.json()['stream']}"
-    with connect(address) as stream:
-        for number in (1, 2):
-            said = {"parts": ["image", "instances"], "name": "frame", "frame_index": 6}
-            stream.send(json.dumps(said | {"timestamp_ns": frames[6].timestamp_ns}))
+    assert (opened.status_code, opened.json()["tracking"]) == (201, True), opened.text
+    answers = []
+    for frame, known in zip(shown, odometry, strict=True):
+        form, files = form_of(frame)
+        form |= {"odometry": ",".join(map(repr, known.ravel().tolist()))}
+        answers.append(served.client.post(opened.json()["frames"], data=form, files=files).json())
+        again = served.client.post(opened.json()["frames"], data=form, files=files).json()
+        assert again == answers[-1]  # a frame that comes once more gets its answer once more
+    assert [tracked(answer) for answer in answers] == wanted
+    assert [answer["frames"] for answer in answers] == [1, 2, 3, 4, 5]
+    assert answers[-1]["map_from_odom"] is not None
+    past = served.client.post(opened.json()["frames"], data=form | {"timestamp_ns": "1"}, files=files)
+    assert (past.status_code, "order of their times" in past.json()["detail"]) == (422, True)
+    other = served.client.post("/v1/maps/office/sessions", json=common).json()["stream"]
+    with connect(f"ws{served.url.removeprefix('http')}{other}") as stream:
+        for number, (frame, known) in enumerate(zip(shown, odometry, strict=True), 1):
+            form, files = form_of(frame)
+            said = {"parts": ["image", "instances"], "name": "frame", "frame_index": frame.index}
+            said |= {"timestamp_ns": frame.timestamp_ns, "odometry": known.ravel().tolist(), "camera": form["camera"]}
+            stream.send(json.dumps(said))
             for part in said["parts"]:
                 stream.send(files[part][1])
             answer = json.loads(stream.recv(timeout=60))
             assert (answer.pop("sequence"), answer.pop("ms") > 0) == (number, True)
-            assert untimed(answer) == wanted
+            assert tracked(answer) == wanted[number - 1]
+
+
+def test_what_sessions_refuse(served: Served, frames: list[Frame]) -> None:
+    _, files = form_of(frames[6])
+    opened = served.client.post("/v1/maps/office/sessions", json={})
+    address = f"ws{served.url.removeprefix('http')}{opened.json()['stream']}"
+    with connect(address) as stream:
         stream.send(b"no picture")
         assert json.loads(stream.recv(timeout=60))["status"] == 422
         stream.send(json.dumps({"parts": ["image", "image"]}))
         with pytest.raises(ConnectionClosed) as closed:
             stream.recv(timeout=60)
         assert (closed.value.rcvd.code, "expected as JSON" in closed.value.rcvd.reason) == (1008, True)
+    for said in ({"odometry": ["x"]}, {"time_s": "1"}, {"camera": 1}, {"categories": [1]}, {"parts": [[]]}, []):
+        with connect(address) as stream:
+            stream.send(json.dumps(said))
+            with pytest.raises(ConnectionClosed):
+                stream.recv(timeout=60)
+    for odometry in ("1,2", "nan,0,0,1,0,0,0", "0,0,0,2,0,0,0", "x"):
+        answer = served.client.post(opened.json()["frames"], data={"odometry": odometry}, files=files)
+        assert (answer.status_code, "odometry" in answer.json()["detail"]) == (422, True), answer.text
     for session in ("none", opened.json()["session"][:-4] + "AAAA"):
         assert served.client.post(f"/v1/sessions/{session}/frames", files=files).status_code == 404
-        with pytest.raises(InvalidStatus):
+        with pytest.raises(InvalidStatus) as refused:
             connect(f"ws{served.url.removeprefix('http')}/v1/sessions/{session}/stream")
+        assert refused.value.response.status_code == 404
     with pytest.raises(InvalidStatus):
         connect(address, origin="https://evil.example")
     assert served.client.post("/v1/maps/office/sessions", json={"depth": 1}).status_code == 422
+    assert served.client.post("/v1/maps/office/sessions", json={"like": "/etc"}).status_code == 422
     assert served.client.post("/v1/maps/attic/sessions", json={}).status_code == 404
+
+
+def test_cameras_are_so_many_and_let_go_when_nothing_comes(served: Served, frames: list[Frame]) -> None:
+    form, files = form_of(frames[6])
+    other = semdb.open(served.database.settings.database_url, cache_dir=served.folder / "cache", threads=1)
+    with running(other, ServeSettings(sessions=2, session_idle_s=1.0)) as small:
+        first, second = (small.client.post("/v1/maps/office/sessions", json={}).json() for _ in range(2))
+        full = small.client.post("/v1/maps/office/sessions", json={})
+        assert (full.status_code, int(full.headers["retry-after"]) >= 1) == (429, True)
+        assert small.client.delete(f"/v1/sessions/{second['session']}").json() == {"ended": True}
+        with connect(f"ws{small.url.removeprefix('http')}{first['stream']}") as stream, pytest.raises(ConnectionClosed):
+            stream.recv(timeout=30)  # nothing comes of it, so it ends
+        deadline = time.monotonic() + 20
+        while len(small.service.sessions) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert len(small.service.sessions) == 0
+        late = small.client.post(first["frames"], data=form, files=files).json()
+        assert (late["frames"], "looked for anew" in late["notes"][0]) == (1, True)
+        with ThreadPoolExecutor(12) as pool:  # one camera is one at a time, and few wait
+            sent = [form | {"timestamp_ns": str(number)} for number in range(10**12, 10**12 + 12)]
+            told = list(pool.map(lambda one: small.client.post(first["frames"], data=one, files=files), sent))
+        assert {answer.status_code for answer in told} <= {200, 422, 429}
+        assert 429 in {answer.status_code for answer in told}
 
 
 def test_many_clients_at_once(served: Served, frames: list[Frame]) -> None:

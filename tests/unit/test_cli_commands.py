@@ -359,7 +359,7 @@ def test_accounts_are_printed_as_sql() -> None:
         "maps_writer",
         "maps_reader",
     ]
-    assert "GRANT SELECT, SHOW VIEW ON `maps`.* TO 'maps_reader'@'%';" in statements
+    assert "GRANT CREATE, SELECT, SHOW VIEW ON `maps`.`keyframes` TO 'maps_reader'@'%';" in statements
     urls = {line.split()[1]: line.split()[-1] for line in output.splitlines() if line.startswith("-- ")}
     assert set(urls) == {"owner", "writer", "reader"}
     assert urls["reader"].startswith("mysql+pymysql://maps_reader:")
@@ -368,6 +368,8 @@ def test_accounts_are_printed_as_sql() -> None:
     assert "SQLite has no accounts" in run("init", "--accounts", code=2).stderr
     assert "--execute goes with --accounts" in run("init", "--execute", code=2).stderr
     assert "--rotate goes with --accounts" in run("init", "--rotate", code=2).stderr
+    assert "--grants goes with --accounts" in run("init", "--grants", code=2).stderr
+    assert "one after the other" in run("init", "--reader", "--grants", "--rotate", code=2).stderr
 
 
 def test_new_passwords_are_printed_as_sql() -> None:

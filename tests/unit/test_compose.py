@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import yaml
 
-from semdb.database.accounts import RIGHTS
+from semdb.database.accounts import RIGHTS, plan_accounts
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 COMPOSE = REPOSITORY / "docker-compose.yml"
@@ -126,7 +126,10 @@ def test_the_script_of_the_accounts_grants_what_semdb_does(tmp_path: Path) -> No
     statements = (tmp_path / "statements").read_text()
     for role, rights in RIGHTS.items():
         assert f"CREATE USER 'semdb_{role}'@'%' IDENTIFIED BY 'word{role}1';" in statements
-        assert f"GRANT {rights} ON semdb.* TO 'semdb_{role}'@'%';" in statements
+        assert (f"GRANT {rights} ON semdb.* TO 'semdb_{role}'@'%';" in statements) == (role != "reader")
+    plan = plan_accounts("mysql+pymysql://root@127.0.0.1/semdb", roles=("reader",))
+    for statement in plan.statements[1:]:
+        assert f"{statement};" in statements.splitlines()
     assert "word" not in (tmp_path / "arguments").read_text()
     refused = subprocess.run(
         ["bash", str(script)],

@@ -1,0 +1,73 @@
+"""Cameras that this process tracks: so many at once, each for as long as frames of it come."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from semdb.door.protocol import CameraTracker
+from semdb.service.problems import busy
+
+MOST_WAITING = 4  # frames of one camera
+
+
+@dataclass(eq=False)
+class Live:
+    """A camera that is tracked, or is about to be."""
+
+    tracker: CameraTracker | None = None
+    opened: bool = False  # by its first request, not by a frame
+    frames: int = 0
+    used_s: float = 0.0
+    waiting: int = 0
+    turn: asyncio.Lock = field(default_factory=asyncio.Lock)
+    running: threading.Lock = field(default_factory=threading.Lock)  # also of those whose client went away meanwhile
+    last: tuple[bytes | None, dict[str, Any]] | None = None
+
+
+class Sessions:
+    """The cameras of this process by the id of their session; used on the loop alone."""
+
+    def __init__(self, most: int, idle_s: float) -> None:
+        self._most, self._idle_s = most, idle_s
+        self._live: dict[str, Live] = {}
+
+    def __len__(self) -> int:
+        return len(self._live)
+
+    @asynccontextmanager
+    async def use(self, name: str) -> AsyncIterator[Live]:
+        """The camera of that session, for one at a time. Raises Problem 429 where no more are taken."""
+        live = self._live.get(name)
+        if live is None:
+            self.forget()
+            if len(self._live) >= self._most:
+                raise busy(f"{self._most} cameras are tracked already", self._idle_s / 4)
+            live = self._live[name] = Live()
+        if live.waiting >= MOST_WAITING:
+            raise busy("frames of this session wait already: send the next one when the last one is answered", 1)
+        live.waiting += 1
+        try:
+            async with live.turn:
+                live.used_s = time.monotonic()
+                yield live
+        finally:
+            live.waiting -= 1
+            live.used_s = time.monotonic()
+            if live.tracker is None and not live.waiting:
+                self.end(name)
+
+    def end(self, name: str) -> None:
+        """Lets a camera go."""
+        self._live.pop(name, None)
+
+    def forget(self) -> None:
+        """Lets those go of which nothing came for too long."""
+        last = time.monotonic() - self._idle_s
+        for name in [name for name, live in self._live.items() if not live.waiting and live.used_s < last]:
+            self.end(name)
