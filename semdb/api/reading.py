@@ -98,14 +98,22 @@ class Reading(Base):
         """Raises NotFoundError, naming it, for a keyframe that is not there; damaged ones are."""
         self._store().check_keyframes([int(key) for key in ids])
 
-    def loops(self, map: str | None = None, *, odometry: bool = False) -> list[KeyframeLink]:
+    def loops(
+        self,
+        map: str | None = None,
+        *,
+        odometry: bool = False,
+        after: tuple[int, int, str] | None = None,
+        limit: int | None = None,
+    ) -> list[KeyframeLink]:
         """What ties keyframes of a map, or of all, together: closures, and with `odometry` what follows each other.
 
-        By keyframe ids. A damaged row is left out aloud. Raises NotFoundError.
+        By the ids of both keyframes and kind, with `limit` so many of those after such a key. A damaged row is left
+        out aloud. Raises NotFoundError.
         """
         from semdb.api.links import links_of
 
-        return links_of(self._store(), self._map_id(map), odometry=odometry)
+        return links_of(self._store(), self._map_id(map), odometry=odometry, after=after, limit=limit)
 
     def find(
         self,
@@ -158,12 +166,24 @@ class Reading(Base):
 
         return plot_changes(self._store(), found, Path(folder))
 
-    def landmarks(self, map: str) -> list[StoredLandmark]:
-        """The landmarks of a map by id. Raises NotFoundError, CodecError for a damaged row."""
-        from semdb.database.landmark_reading import load_landmarks
+    def landmarks(
+        self,
+        map: str,
+        *,
+        category: str | None = None,
+        state: str | None = None,
+        after: int = 0,
+        limit: int | None = None,
+    ) -> list[StoredLandmark]:
+        """The landmarks of a map by id, those of a class and state, `limit` of those after an id.
+
+        Raises NotFoundError, CodecError for a damaged row.
+        """
+        from semdb.database.landmark_reading import list_landmarks
 
         store = self._store()
-        return load_landmarks(store.engine, store.find_map(map).id)[0]
+        of_map = store.find_map(map).id
+        return list_landmarks(store.engine, of_map, category=category, state=state, after=after, limit=limit)
 
     def plot_found(self, found: Found, folder: PathText) -> list[Path]:
         """Draws the maps of the hits from above, the hits in red, as ``MAP-landmarks.png``. Returns the files.

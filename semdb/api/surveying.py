@@ -35,12 +35,23 @@ class Surveying(Base):
                 return True
         return False
 
-    def relations(self, map: str) -> list[StoredRelation]:
-        """How the landmarks of a map stand to each other, by ids. Raises NotFoundError, CodecError."""
-        from semdb.database.landmark_reading import load_landmarks
+    def relations(
+        self,
+        map: str,
+        *,
+        kind: str | None = None,
+        landmark: int | None = None,
+        after: tuple[int, int, str] | None = None,
+        limit: int | None = None,
+    ) -> list[StoredRelation]:
+        """How the landmarks of a map stand to each other, or one to others, by both ids and kind.
 
-        store = self._store()
-        return load_landmarks(store.engine, self._head(map).id)[1]
+        With `limit` so many of those after such a key. Raises NotFoundError.
+        """
+        from semdb.database.landmark_reading import list_relations
+
+        of_map = self._head(map).id
+        return list_relations(self._store().engine, of_map, kind=kind, landmark=landmark, after=after, limit=limit)
 
     def up(self, map: str) -> tuple[float, float, float] | None:
         """Which way is up in a map, a unit vector; None where nobody found out. Raises NotFoundError, CodecError."""

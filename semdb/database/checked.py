@@ -15,7 +15,7 @@ from enum import StrEnum
 from typing import Any, TypeVar
 
 import numpy as np
-from sqlalchemy import Column, LargeBinary, case, func, literal
+from sqlalchemy import Column, LargeBinary, and_, case, func, literal, or_
 from sqlalchemy.sql.elements import ColumnElement
 
 from semdb.errors import CodecError
@@ -187,3 +187,13 @@ def shown(value: Any) -> str:
         return "NULL"
     plain = repr(value[: _SHOWN + 1] if isinstance(value, str) else value)
     return plain if len(plain) <= _SHOWN else f"{plain[:_SHOWN]}..."
+
+
+def later(columns: Sequence[ColumnElement[Any]], key: Sequence[Any]) -> ColumnElement[bool]:
+    """Whether a row comes after the one of `key` in the order of `columns`: for pages of lists.
+
+    Written out, since MySQL does not use an index for a comparison of tuples.
+    """
+    first, *rest = columns
+    beyond: ColumnElement[bool] = first > key[0]
+    return and_(first >= key[0], or_(beyond, later(rest, key[1:]))) if rest else beyond

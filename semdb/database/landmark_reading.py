@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Engine, select
+from sqlalchemy import Engine, or_, select
 
 from semdb.database import checked, retry
 from semdb.database.tables import categories, keyframes, landmark_relations, landmarks, recordings
@@ -56,7 +56,26 @@ def load_landmarks(
     engine: Engine, map_id: int, bad: Callable[[str], None] | None = None
 ) -> tuple[list[StoredLandmark], list[StoredRelation]]:
     """The landmarks of a map by id, and their relations. A damaged row is told to `bad`, or raises CodecError."""
-    m, r = landmarks.c, landmark_relations.c
+    found = list_landmarks(engine, map_id, bad=bad)
+    known = {item.id for item in found}
+    kept = [
+        one for one in list_relations(engine, map_id) if one.landmark_id in known and one.other_landmark_id in known
+    ]
+    return found, kept
+
+
+def list_landmarks(
+    engine: Engine,
+    map_id: int,
+    *,
+    category: str | None = None,
+    state: str | None = None,
+    after: int = 0,
+    limit: int | None = None,
+    bad: Callable[[str], None] | None = None,
+) -> list[StoredLandmark]:
+    """Landmarks of a map by id, `limit` of those after an id. A damaged row is told to `bad`, or raises CodecError."""
+    m = landmarks.c
     query = (
         select(*(c for c in m if c.name != "appearance"), categories.c.name.label("category"))
         .add_columns(recordings.c.name.label("last_recording"), keyframes.c.frame_index.label("last_frame_index"))
@@ -65,31 +84,54 @@ def load_landmarks(
             .outerjoin(keyframes, keyframes.c.id == m.last_keyframe_id)
             .outerjoin(recordings, recordings.c.id == keyframes.c.recording_id)
         )
-        .where(m.map_id == map_id)
+        .where(m.map_id == map_id, m.id > after)
         .order_by(m.id)
+        .limit(limit)
     )
-    related = (
-        select(*r)
-        .select_from(landmark_relations.join(landmarks, m.id == r.landmark_id))
-        .where(m.map_id == map_id)
-        .order_by(r.landmark_id, r.other_landmark_id, r.kind)
-    )
-    rows, relations = retry.read(engine, lambda c: (list(c.execute(query)), list(c.execute(related))))
+    for column, wanted in ((categories.c.name, category), (m.state, state)):
+        if wanted is not None:
+            query = query.where(column == wanted)
     found = []
-    for row in rows:
+    for row in retry.read(engine, lambda connection: list(connection.execute(query))):
         try:
             found.append(_landmark(row))
         except CodecError as error:
             if bad is None:
                 raise
             bad(f"a landmark is left out, run semdb refine --force: {error}")
-    known = {item.id for item in found}
-    kept = [
+    return found
+
+
+def list_relations(
+    engine: Engine,
+    map_id: int,
+    *,
+    kind: str | None = None,
+    landmark: int | None = None,
+    after: tuple[int, int, str] | None = None,
+    limit: int | None = None,
+) -> list[StoredRelation]:
+    """How landmarks of a map stand to each other, by ids and kind, `limit` of those after a key; or those of one."""
+    r, one, other = landmark_relations.c, landmarks.alias("one"), landmarks.alias("other")
+    query = (
+        select(*r)
+        .select_from(
+            landmark_relations.join(one, one.c.id == r.landmark_id).join(other, other.c.id == r.other_landmark_id)
+        )
+        .where(one.c.map_id == map_id, other.c.map_id == map_id)
+        .order_by(r.landmark_id, r.other_landmark_id, r.kind)
+        .limit(limit)
+    )
+    if kind is not None:
+        query = query.where(r.kind == kind)
+    if landmark is not None:
+        query = query.where(or_(r.landmark_id == landmark, r.other_landmark_id == landmark))
+    if after is not None:
+        query = query.where(checked.later((r.landmark_id, r.other_landmark_id, r.kind), after))
+    return [
         StoredRelation(int(x.landmark_id), str(x.kind), int(x.other_landmark_id), float(x.score))
-        for x in relations
-        if int(x.landmark_id) in known and int(x.other_landmark_id) in known
+        for x in retry.read(engine, lambda connection: list(connection.execute(query)))
     ]
-    return found, kept
 
 
 def _landmark(row: Any) -> StoredLandmark:

@@ -28,6 +28,7 @@ from semdb.types import FloatArray
 CHUNK = 500
 MOST_MATRIX = 1024  # bytes of the blob of a 6x6 matrix
 LARGEST_ID = 2**63 - 1
+Key = tuple[int, int, str]  # of a link: both keyframes and its kind
 _LINK = (*POSE_COLUMNS, "information", "inliers", "state", "reason", "provenance")
 
 
@@ -101,24 +102,40 @@ def list_links(
 
     A damaged row is left out and told to `bad` with its first keyframe, or raises CodecError.
     """
+    return page_of_links(engine, map_id, odometry=odometry, bad=bad)[0]
+
+
+def page_of_links(
+    engine: Engine,
+    map_id: int | None = None,
+    *,
+    odometry: bool = True,
+    after: Key | None = None,
+    limit: int | None = None,
+    bad: Bad | None = None,
+) -> tuple[list[Link], Key | None]:
+    """As `list_links`, so many rows of those after a key, and the key of the last row, where there may be more."""
     c = loop_closures.c
     columns = [checked.up_to(column, MOST_MATRIX) if column.name == "information" else column for column in c]
-    query = select(*columns).order_by(c.keyframe_id, c.other_keyframe_id, c.kind)
+    query = select(*columns).order_by(c.keyframe_id, c.other_keyframe_id, c.kind).limit(limit)
+    if after is not None:
+        query = query.where(checked.later((c.keyframe_id, c.other_keyframe_id, c.kind), after))
     if map_id is not None:
         query = query.join(keyframes, keyframes.c.id == c.keyframe_id)
         query = query.join(recordings, recordings.c.id == keyframes.c.recording_id)
         query = query.where(recordings.c.map_id == map_id)
     if not odometry:
         query = query.where(c.kind != LinkKind.ODOMETRY.value)
-    found = []
-    for row in retry.read(engine, lambda connection: list(connection.execute(query))):
+    found, rows = [], retry.read(engine, lambda connection: list(connection.execute(query)))
+    for row in rows:
         try:
             found.append(_link(row))
         except CodecError as error:
             if bad is None:
                 raise
             bad(int(row.keyframe_id), error)
-    return found
+    last = rows[-1] if rows and len(rows) == limit else None
+    return found, None if last is None else (last.keyframe_id, last.other_keyframe_id, last.kind)
 
 
 def _link(row: Any) -> Link:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Any
 
 from fastapi import Query, Request
@@ -18,6 +19,7 @@ from semdb.service.state import access_of, read, service_of
 
 table = Table("maps")
 _PICTURE = {"image/jpeg": {"schema": {"type": "string", "format": "binary"}}}
+_PAIR = re.compile(r"[0-9]{1,19}-[0-9]{1,19}-[a-z_]{1,16}")
 Coordinate = Annotated[float | None, Query(ge=-1e7, le=1e7, allow_inf_nan=False, description="metres")]
 
 
@@ -104,12 +106,10 @@ async def list_landmarks(
 ) -> Response:
     """The landmarks of a map by id: things that several keyframes see. `semdb refine` computes them."""
     most = limit or service_of(request).settings.page
-    found = [
-        one
-        for one in await read(request, lambda db: db.landmarks(map))
-        if one.id > after and category in (None, one.category) and state in (None, one.state)
-    ]
-    return page_of(request, found[: most + 1], most, lambda one: one.id, lambda one: values.landmark_dict(one, map))
+    found = await read(
+        request, lambda db: db.landmarks(map, category=category, state=state, after=after, limit=most + 1)
+    )
+    return page_of(request, found, most, lambda one: one.id, lambda one: values.landmark_dict(one, map))
 
 
 @table.route("GET", "/v1/maps/{map}/landmarks/{landmark}", READ, schemas.Landmark)
@@ -117,10 +117,10 @@ async def get_landmark(request: Request, map: MapName, landmark: KeyframeId) -> 
     """A landmark, and how it stands to others."""
 
     def look(db: Database) -> dict[str, Any]:
-        found = [one for one in db.landmarks(map) if one.id == landmark]
-        if not found:
+        found = db.landmarks(map, after=landmark - 1, limit=1)
+        if not found or found[0].id != landmark:
             raise not_found(f"landmark {landmark} in the map {map!r}")
-        related = [one for one in db.relations(map) if landmark in (one.landmark_id, one.other_landmark_id)]
+        related = db.relations(map, landmark=landmark)
         shown = [values.relation_dict(one) for one in related]
         return values.landmark_dict(found[0], map) | {"relations": shown}
 
@@ -136,24 +136,22 @@ async def list_relations(
     limit: Limit = None,
 ) -> Response:
     """How the landmarks of a map stand to each other, by ids."""
-    most = limit or service_of(request).settings.page
-
-    def key(one: Any) -> tuple[int, int, str]:
-        return (one.landmark_id, one.other_landmark_id, one.kind)
-
-    found = [one for one in await read(request, lambda db: db.relations(map)) if kind in (None, one.kind)]
-    later = [one for one in sorted(found, key=key) if after is None or key(one) > _relation_key(after)]
+    most, last = limit or service_of(request).settings.page, _pair_key(after)
+    found = await read(request, lambda db: db.relations(map, kind=kind, after=last, limit=most + 1))
     return page_of(
-        *(request, later[: most + 1], most),
-        lambda one: "-".join(str(part) for part in key(one)),
+        *(request, found, most),
+        lambda one: f"{one.landmark_id}-{one.other_landmark_id}-{one.kind}",
         values.relation_dict,
     )
 
 
-def _relation_key(after: str) -> tuple[int, int, str]:
+def _pair_key(after: str | None) -> tuple[int, int, str] | None:
+    """Two ids and a kind. Raises Problem 422."""
+    if after is None:
+        return None
     first, _, rest = after.partition("-")
     second, _, kind = rest.partition("-")
-    if not (first.isdecimal() and second.isdecimal()):
+    if not _PAIR.fullmatch(after) or max(int(first), int(second)) >= 2**63:
         raise Problem(422, "after is no key of an earlier page")
     return int(first), int(second), kind
 
@@ -213,14 +211,15 @@ async def list_loops(
     request: Request,
     map: MapName,
     odometry: Annotated[bool, Query(description="also what follows each other")] = False,
-    after: Annotated[int, Query(ge=0, le=2**53, description="key of an earlier page")] = 0,
+    after: Annotated[str | None, Query(max_length=100, description="key of an earlier page")] = None,
     limit: Limit = None,
 ) -> Response:
     """What ties keyframes of a map together, by ids."""
-    most = limit or service_of(request).settings.page
-    found = list(enumerate(await read(request, lambda db: db.loops(map, odometry=odometry)), 1))
-    later = found[after : after + most + 1]
-    return page_of(request, later, most, lambda one: one[0], lambda one: values.link_dict(one[1]))
+    most, last = limit or service_of(request).settings.page, _pair_key(after)
+    found = await read(request, lambda db: db.loops(map, odometry=odometry, after=last, limit=most + 1))
+    return page_of(
+        *(request, found, most), lambda one: f"{one.keyframe}-{one.other_keyframe}-{one.kind}", values.link_dict
+    )
 
 
 @table.route("GET", "/v1/maps/{map}/coverage", READ, schemas.CoverageModel)
