@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Self
 from semdb.api.base import Say
 from semdb.api.describing import Describing
 from semdb.api.granting import Granting
-from semdb.api.surveying import Surveying
+from semdb.api.scenes import Viewing
 from semdb.api.tracing import Tracing
 from semdb.api.tracking import TrackingCameras
 from semdb.api.working import Working
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from semdb.door.protocol import SemanticDatabase
 
 
-class Database(Describing, Writing, Tracing, TrackingCameras, Surveying, Granting, Working):
+class Database(Describing, Writing, Tracing, TrackingCameras, Viewing, Granting, Working):
     """A semantic database. Made by `semdb.open`; close it, or use it in a ``with``.
 
     Any number of threads may ask it at the same time. Networks, indexes and keyframes stay in memory from one call to

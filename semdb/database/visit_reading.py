@@ -88,6 +88,21 @@ def load_visits(
     return found
 
 
+def visits_of_landmark(engine: Engine, map_id: int, landmark_id: int) -> list[LandmarkVisit]:
+    """What the recordings of a map say of one landmark, by the recording's id. Raises CodecError for a damaged row."""
+    v, r = landmark_visits.c, recordings.c
+    query = (
+        select(
+            r.name.label("recording"), *(column for column in v if column.name not in ("landmark_id", "recording_id"))
+        )
+        .select_from(landmark_visits.join(recordings, r.id == v.recording_id))
+        .where(v.landmark_id == int(landmark_id), r.map_id == map_id)
+        .order_by(r.id)
+    )
+    rows = retry.read(engine, lambda connection: list(connection.execute(query)))
+    return [_visit(row, f"of landmark {landmark_id}") for row in rows]
+
+
 def _landmark(key: int, rows: Sequence[Any]) -> VisitedLandmark:
     first, where = rows[0], f"of landmark {key}"
     try:

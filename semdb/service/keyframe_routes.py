@@ -13,7 +13,7 @@ from semdb.api import Database
 from semdb.door.values import Keyframe, encode
 from semdb.service import schemas, values
 from semdb.service.answers import encoded, tagged
-from semdb.service.problems import not_found
+from semdb.service.problems import Problem, not_found
 from semdb.service.roles import READ
 from semdb.service.routing import KeyframeId, Table
 from semdb.service.state import access_of, read
@@ -41,10 +41,20 @@ async def get_keyframe(request: Request, keyframe: KeyframeId) -> Response:
 
 
 @table.route("GET", "/v1/keyframes/{keyframe}/image", READ, errors=_NOT_CHANGED, only=_IMAGES)
-async def get_image(request: Request, keyframe: KeyframeId) -> Response:
-    """The colour image, bytes as recorded. It never changes."""
+async def get_image(
+    request: Request,
+    keyframe: KeyframeId,
+    width: Annotated[int | None, Query(ge=16, le=4096, description="a JPEG of at most so many pixels")] = None,
+    box: Annotated[
+        str | None, Query(max_length=200, description="only x1,y1,x2,y2 in pixels", examples=["60,40,259,199"])
+    ] = None,
+) -> Response:
+    """The colour image, bytes as recorded; with `width` or `box` a smaller one. It never changes."""
     await keyframe_of(request, keyframe)
     stored = await read(request, lambda db: db.keyframe_files(keyframe))
+    if width is not None or box is not None:
+        smaller = await read(request, lambda _: part_of(stored.rgb, keyframe, width, box))
+        return tagged(request, smaller, "image/jpeg", for_ever=True)
     return tagged(request, stored.rgb, MEDIA.get(stored.rgb_format, "application/octet-stream"), for_ever=True)
 
 
@@ -113,6 +123,33 @@ async def get_mask(request: Request, keyframe: KeyframeId) -> Response:
         return png_of(labels)
 
     return tagged(request, await read(request, draw), "image/png", for_ever=True)
+
+
+def part_of(file: bytes, keyframe: int, width: int | None, box: str | None) -> bytes:
+    """A JPEG of an image, or of a box of it, of at most `width` pixels. Raises Problem 422, FrameError."""
+    import cv2
+
+    from semdb.recordings.images import decode_color
+
+    image = decode_color(file, f"keyframe {keyframe}")
+    if box is not None:
+        image = image[_slices(box, image.shape[0], image.shape[1])]
+    if width is not None and image.shape[1] > width:
+        height = max(1, round(image.shape[0] * width / image.shape[1]))
+        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    return encode(np.ascontiguousarray(image), ".jpg")
+
+
+def _slices(box: str, height: int, width: int) -> tuple[slice, slice]:
+    try:
+        x1, y1, x2, y2 = (min(max(float(part), -1e6), 1e6) for part in box.split(","))
+        left, top, right, bottom = (round(value) for value in (x1, y1, x2, y2))
+    except ValueError:
+        raise Problem(422, "box is x1,y1,x2,y2 in pixels") from None
+    left, top, right, bottom = max(0, left), max(0, top), min(width - 1, right), min(height - 1, bottom)
+    if right < left or bottom < top:
+        raise Problem(422, f"the box is outside of the image, which has {width}x{height} pixels")
+    return slice(top, bottom + 1), slice(left, right + 1)
 
 
 def png_of(labels: Any) -> bytes:

@@ -12,8 +12,10 @@ from semdb.types import BoolArray, Camera, FloatArray, Keypoints, ModelInfo
 
 if TYPE_CHECKING:
     from semdb.database.landmark_reading import StoredLandmark, StoredRelation
+    from semdb.database.landmark_records import LandmarkVisit
     from semdb.database.query_log import LoggedQuery
     from semdb.database.records import MapInfo, RecordingStatus
+    from semdb.database.scene_reading import StoredSighting
     from semdb.door.found import Found
     from semdb.door.links import KeyframeLink
     from semdb.door.tracked import Tracked
@@ -202,6 +204,30 @@ def relation_dict(found: StoredRelation) -> dict[str, Any]:
         "other_landmark": found.other_landmark_id,
         "score": found.score,
     }
+
+
+def sighting_dict(found: StoredSighting) -> dict[str, Any]:
+    """An object that shows a landmark."""
+    return {
+        "landmark": found.landmark_id,
+        "object": found.object_id,
+        "ordinal": found.ordinal,
+        "keyframe": found.keyframe_id,
+        "recording": found.recording,
+        "frame_index": found.frame_index,
+        "timestamp_ns": found.timestamp_ns,
+        "category": found.category,
+        "score": found.score,
+        "box": list(found.box),
+        "coverage": found.coverage,
+        "visibility": found.visibility,
+    }
+
+
+def visit_dict(found: LandmarkVisit) -> dict[str, Any]:
+    """What a recording says of a landmark."""
+    names = ("recording", "presence", "keyframes", "seen", "seen_through", "occluded", "missed", "position", "size")
+    return {name: getattr(found, name) for name in names}
 
 
 def link_dict(found: KeyframeLink) -> dict[str, Any]:

@@ -3,6 +3,8 @@
 export interface Route {
   /** Segments; one that begins with a colon is a parameter: ["maps", ":map", "queries"]. */
   path: readonly string[];
+  /** Other paths that are the same view. */
+  also?: readonly (readonly string[])[];
   load: () => Promise<View>;
 }
 
@@ -35,10 +37,11 @@ export function match(routes: readonly Route[], path: string): Matched | null {
   } catch {
     return null;
   }
-  for (const route of routes) {
-    if (route.path.length !== parts.length) continue;
+  const spelled = routes.flatMap((route) => [route.path, ...(route.also ?? [])].map((path) => ({ route, path })));
+  for (const { route, path: segments } of spelled) {
+    if (segments.length !== parts.length) continue;
     const params: Record<string, string> = {};
-    const fits = route.path.every((segment, index) => {
+    const fits = segments.every((segment, index) => {
       const part = parts[index] ?? "";
       if (!segment.startsWith(":")) return segment === part;
       params[segment.slice(1)] = part;

@@ -2,6 +2,13 @@
 import type { Route } from "./router";
 
 export const routes: readonly Route[] = [
-  { path: [], load: async () => (await import("./views/maps")).maps },
-  { path: ["maps"], load: async () => (await import("./views/maps")).maps },
+  { path: ["maps"], also: [[]], load: async () => (await import("./views/maps")).maps },
+  {
+    path: ["maps", ":map"],
+    also: [
+      ["maps", ":map", "keyframes", ":keyframe"],
+      ["maps", ":map", "landmarks", ":landmark"],
+    ],
+    load: async () => (await import("./views/map")).map,
+  },
 ];

@@ -1,7 +1,7 @@
 // What is around every view: skip link, header, keys, help.
 import { go } from "./router";
 import { texts } from "./texts";
-import { h } from "./ui/h";
+import { h, svg } from "./ui/h";
 import { key } from "./ui/keys";
 import { a, button, dialog } from "./ui/parts";
 import { toggleTheme } from "./ui/theme";
@@ -25,7 +25,7 @@ export function shell(): HTMLElement {
       h("nav", { attrs: { "aria-label": texts.nav.label } }, links),
       h("div", { id: "tools", class: "tools" }),
       button("◐", toggleTheme, { class: "icon", label: texts.nav.theme, title: `${texts.nav.theme} (t)` }),
-      button("⚿", () => askForToken(null), { class: "icon", label: texts.nav.token, title: texts.nav.token }),
+      button(keySign(), () => askForToken(null), { class: "icon", label: texts.nav.token, title: texts.nav.token }),
       button("?", help, { class: "icon", label: texts.nav.help, title: `${texts.nav.help} (?)` }),
     ),
     main,
@@ -45,6 +45,12 @@ export function shell(): HTMLElement {
   key("t", toggleTheme);
   for (const [address, , letter] of PAGES) key(`g ${letter}`, () => go(address));
   return main;
+}
+
+function keySign(): SVGElement {
+  const sign = svg("svg", { viewBox: "0 0 20 20", width: 18, height: 18, "aria-hidden": "true" });
+  sign.append(svg("path", { d: "M12.5 3a4.500 4.500 0 1 1-3.900 6.750L3 15.300V17h3v-2h2v-2h1.500l1.600-1.600M13.500 6.500h.01", fill: "none", stroke: "currentColor", "stroke-width": 1.6, "stroke-linecap": "round", "stroke-linejoin": "round" }));
+  return sign;
 }
 
 let helping: HTMLDialogElement | null = null;

@@ -1,0 +1,86 @@
+"""What pages show of a landmark and of a keyframe: which objects show which landmark."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import Engine, select
+
+from semdb.database import checked, retry
+from semdb.database.tables import categories, keyframes, landmark_sightings, landmarks, objects, recordings
+
+
+@dataclass(frozen=True, slots=True)
+class StoredSighting:
+    """An object that shows a landmark; `box` is x1, y1, x2, y2 in pixels of its keyframe.
+
+    `coverage` says how much of the landmark the object shows, `visibility` how much of it could be seen from there.
+    """
+
+    landmark_id: int
+    object_id: int
+    ordinal: int
+    keyframe_id: int
+    recording: str
+    frame_index: int
+    timestamp_ns: int | None
+    category: str
+    score: float
+    box: tuple[float, float, float, float]
+    coverage: float
+    visibility: float
+
+
+def sightings_of_landmark(engine: Engine, map_id: int, landmark_id: int) -> list[StoredSighting]:
+    """All sightings of a landmark of a map, by time, then id. Raises CodecError for a damaged row."""
+    query = _statement().where(landmark_sightings.c.landmark_id == int(landmark_id), landmarks.c.map_id == map_id)
+    return _read(engine, query)
+
+
+def sightings_in_keyframe(engine: Engine, keyframe_id: int) -> list[StoredSighting]:
+    """The landmarks that objects of a keyframe show. Raises CodecError for a damaged row."""
+    return _read(engine, _statement().where(objects.c.keyframe_id == int(keyframe_id)))
+
+
+def _statement() -> Any:
+    s, o, k = landmark_sightings.c, objects.c, keyframes.c
+    return (
+        select(s.landmark_id, s.object_id, s.coverage, s.visibility, o.keyframe_id, o.ordinal, o.score)
+        .add_columns(o.x1, o.y1, o.x2, o.y2, categories.c.name.label("category"))
+        .add_columns(recordings.c.name.label("recording"), k.frame_index, k.timestamp_ns)
+        .select_from(
+            landmark_sightings.join(objects, o.id == s.object_id)
+            .join(landmarks, landmarks.c.id == s.landmark_id)
+            .join(keyframes, k.id == o.keyframe_id)
+            .join(recordings, recordings.c.id == k.recording_id)
+            .join(categories, categories.c.id == o.category_id)
+        )
+        .order_by(k.timestamp_ns, s.object_id)
+    )
+
+
+def _read(engine: Engine, query: Any) -> list[StoredSighting]:
+    return [_sighting(row) for row in retry.read(engine, lambda c: list(c.execute(query)))]
+
+
+def _sighting(row: Any) -> StoredSighting:
+    where = f"of object {row.object_id}"
+
+    def real(name: str) -> float:
+        return checked.real(getattr(row, name), f"{name} {where}", -1e7, 1e7)
+
+    return StoredSighting(
+        landmark_id=int(row.landmark_id),
+        object_id=int(row.object_id),
+        ordinal=int(row.ordinal),
+        keyframe_id=int(row.keyframe_id),
+        recording=str(row.recording),
+        frame_index=int(row.frame_index),
+        timestamp_ns=None if row.timestamp_ns is None else int(row.timestamp_ns),
+        category=checked.text(row.category, f"categories.name {where}"),
+        score=real("score"),
+        box=(real("x1"), real("y1"), real("x2"), real("y2")),
+        coverage=real("coverage"),
+        visibility=real("visibility"),
+    )

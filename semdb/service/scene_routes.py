@@ -1,0 +1,76 @@
+"""What viewers draw of a map, and what shows what."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from typing import Annotated
+
+from fastapi import Query, Request
+from starlette.responses import Response
+
+from semdb.api import Database
+from semdb.service import schemas, values
+from semdb.service.answers import as_json, encoded, tagged
+from semdb.service.keyframe_routes import keyframe_of
+from semdb.service.roles import READ
+from semdb.service.routing import KeyframeId, MapName, Table
+from semdb.service.state import read
+
+table = Table("views")
+MOST_CLOUDS = 4  # that are kept in memory
+_FILE = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
+_clouds: OrderedDict[tuple[str, str, str, int], bytes] = OrderedDict()
+_turn = threading.Lock()
+
+
+@table.route("GET", "/v1/maps/{map}/scene", READ, schemas.Scene, errors=(304,))
+async def get_scene(request: Request, map: MapName) -> Response:
+    """All keyframes, landmarks and accepted links of a map, column by column: what a viewer draws."""
+    found = await read(request, lambda db: encoded(db.scene(map)))
+    return tagged(request, found, "application/json", for_ever=False)
+
+
+@table.route("GET", "/v1/maps/{map}/points", READ, errors=(304,), only=_FILE)
+async def get_points(
+    request: Request,
+    map: MapName,
+    count: Annotated[int, Query(ge=1, le=1_000_000, description="so many at most")] = 100_000,
+) -> Response:
+    """Coloured points of a map, in an order of which every beginning is spread over all of it.
+
+    Little-endian: uint32 number of points, uint32 keyframes that they are of, float32 lowest x, y, z and step x, y, z
+    in metres, then uint16 x, y, z of each point in steps above the lowest, then uint8 red, green, blue of each.
+    """
+    found = await read(request, lambda db: _points(db, map, count))
+    return tagged(request, found, "application/octet-stream", for_ever=False)
+
+
+def _points(db: Database, map_name: str, count: int) -> bytes:
+    key = (db.url, map_name, db.map_state(map_name), count)
+    with _turn:
+        if key in _clouds:
+            _clouds.move_to_end(key)
+            return _clouds[key]
+    packed = db.cloud(map_name, count).packed()
+    with _turn:
+        _clouds[key] = packed
+        while len(_clouds) > MOST_CLOUDS:
+            _clouds.popitem(last=False)
+    return packed
+
+
+@table.route("GET", "/v1/maps/{map}/landmarks/{landmark}/sightings", READ, schemas.LandmarkHistory)
+async def list_sightings(request: Request, map: MapName, landmark: KeyframeId) -> Response:
+    """The objects of keyframes that show a landmark, by time, and what each recording says of it."""
+    found, visits = await read(request, lambda db: (db.sightings(map, landmark), db.visits(map, landmark)))
+    shown = {"sightings": [values.sighting_dict(one) for one in found]}
+    return as_json(shown | {"visits": [values.visit_dict(one) for one in visits]})
+
+
+@table.route("GET", "/v1/keyframes/{keyframe}/landmarks", READ, schemas.Sightings)
+async def list_seen_landmarks(request: Request, keyframe: KeyframeId) -> Response:
+    """The landmarks that a keyframe shows, with the objects that show them."""
+    await keyframe_of(request, keyframe)
+    found = await read(request, lambda db: db.seen_in(keyframe))
+    return as_json({"sightings": [values.sighting_dict(one) for one in found]})
