@@ -9,7 +9,7 @@ import numpy as np
 
 from semdb.api.surveying import Surveying
 from semdb.database.pose_records import LinkState
-from semdb.errors import CodecError, FrameError, UsageError
+from semdb.errors import CodecError, FrameError, NotFoundError, UsageError
 from semdb.geometry import quat_wxyz_from_rotation
 from semdb.types import Camera
 
@@ -78,6 +78,8 @@ class Viewing(Surveying):
                     continue
                 keypoints = content.keypoints(head.id)[0]
                 yield points_of_keypoints(image, keypoints.features.xy, keypoints.points, head.world_from_camera)
+            except NotFoundError:
+                continue  # deleted a moment ago
             except (FrameError, CodecError) as error:
                 self._store().left_out(head.id, CodecError(str(error)))
 

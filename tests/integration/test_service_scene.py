@@ -21,7 +21,7 @@ def served(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ser
     with opener(f"sqlite:///{folder / 'a.sqlite3'}", folder / "cache") as opening:
         database = opening(detector="auto", encoder="auto", features="auto")
         database.ingest(room, map="office", stride=STRIDE)
-        database.refine(map="office", step="landmarks")
+        database.refine("office", steps=["landmarks"])
         database._store().ensure_map("empty")
         with running(database, ServeSettings()) as found:
             yield found

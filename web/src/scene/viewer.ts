@@ -143,7 +143,7 @@ export class Viewer {
     this.points = null;
     if (this.cloud && this.cloud.count > 0) {
       this.points = cloudPoints(this.cloud, this.pointSize(this.cloud));
-      (this.points.material as PointsMaterial).clippingPlanes = this.clipping();
+      this.dress(this.points.material as PointsMaterial);
       this.put("points", this.points);
     }
     this.invalidate();
@@ -248,6 +248,15 @@ export class Viewer {
     return heights[Math.floor(0.01 * heights.length)] ?? 0;
   }
 
+  /** From above points are as large in pixels, and what is over the heads is left out. */
+  private dress(material: PointsMaterial): void {
+    const top = this.mode === "top";
+    material.sizeAttenuation = !top;
+    material.size = top ? 2.2 * this.renderer.getPixelRatio() : this.cloud ? this.pointSize(this.cloud) : 0.02;
+    material.clippingPlanes = this.clipping();
+    material.needsUpdate = true;
+  }
+
   private clipping(): Plane[] {
     if (this.mode !== "top" || !Number.isFinite(this.ceiling)) return [];
     return [new Plane(new V3(...scaled(this.scene.up, -1)), this.ceiling)];
@@ -265,7 +274,7 @@ export class Viewer {
     this.controls.dispose();
     this.controls = this.control(mode === "top" ? this.above : this.perspective);
     this.renderer.localClippingEnabled = mode === "top";
-    if (this.points) (this.points.material as PointsMaterial).clippingPlanes = this.clipping();
+    if (this.points) this.dress(this.points.material as PointsMaterial);
     this.home(false);
   }
 
