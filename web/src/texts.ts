@@ -81,6 +81,11 @@ export const texts = {
     view3d: "3D",
     viewTop: "From above",
     home: "Show all",
+    legend: [
+      ["camera", "keyframes: where images were taken"],
+      ["box", "things, coloured by class"],
+      ["click", "click either to see more"],
+    ] as [string, string][],
     layersLabel: "Layers",
     layers: {
       points: "Points",

@@ -196,7 +196,7 @@ export class Viewer {
     this.chosenLandmarks = new Set(landmarks.map((item) => item.id));
     const { r, g, b } = new Color(colour("--scene-select")).convertLinearToSRGB();
     const paint: [number, number, number] = [r, g, b];
-    if (keyframes.length > 0) this.selection.push(frustumLines(keyframes, 1.5 * this.frustumSize(), [paint]));
+    if (keyframes.length > 0) this.selection.push(frustumLines(keyframes, 1.3 * this.frustumSize(), [paint]));
     if (landmarks.length > 0) this.selection.push(boxLines(landmarks, () => paint));
     for (const object of this.selection) {
       onTop(object as LineSegments);
@@ -333,7 +333,7 @@ export class Viewer {
     const reach = Math.max(...item.size, 0.25);
     if (this.mode === "top") return this.flyAbove(item.position);
     const from = unit(plus(plus(this.state.position, scaled(item.position, -1)), scaled(this.scene.up, 0.2 * this.radius)));
-    this.flyTo(plus(item.position, scaled(from, Math.max(1.1, 3.2 * reach))), item.position);
+    this.flyTo(plus(item.position, scaled(from, Math.max(1.5, 3.4 * reach))), item.position);
   }
 
   /** Behind a keyframe, looking where it looks. */

@@ -52,6 +52,7 @@ class MapView implements Updatable {
   private off: Set<Layer>;
   private mode: Mode;
   private bar: HTMLElement;
+  private readonly legend: HTMLElement;
 
   constructor(
     private readonly name: string,
@@ -66,6 +67,7 @@ class MapView implements Updatable {
     this.search = new Search(this.context, (what) => this.select(what));
     this.bar = this.toolbar();
     this.stage.append(this.bar);
+    this.legend = h("p", { class: "legend" }, texts.map.legend.map(([kind, text]) => h("span", null, h("span", { class: `sign ${kind}`, attrs: { "aria-hidden": "true" } }), text)));
     const side = h("section", { class: "side", attrs: { "aria-label": texts.map.panel } }, this.head(), this.search.element, this.panel.element);
     this.element = h("div", { class: "map-view" }, side, this.stage, this.detail);
     this.stage.append(loading(texts.map.waiting));
@@ -106,7 +108,7 @@ class MapView implements Updatable {
     }
     const { viewer } = this;
     viewer.canvas.setAttribute("aria-label", `${texts.map.scene(this.name)}. ${texts.map.sceneKeys}`);
-    fill(this.stage, viewer.element, this.bar);
+    fill(this.stage, viewer.element, this.bar, this.legend);
     for (const layer of LAYER_NAMES) viewer.show(layer, !this.off.has(layer));
     if (this.mode === "top") viewer.setMode("top");
     theme.watch(() => {

@@ -34,6 +34,12 @@ export function showLandmark(context: MapContext, item: LandmarkItem, place: HTM
   history.catch(() => undefined);
   const about = get<LandmarkInfo>(address, until);
   about.catch(() => undefined);
+  history
+    .then(({ sightings: all }) => {
+      const from = [...new Set(all.map((one) => one.keyframe))].map((id) => context.scene.keyframe(id)).filter((one) => one !== undefined);
+      if (!until.aborted) context.viewer()?.highlight(from, [item]);
+    })
+    .catch(() => undefined);
   const mark = h("span", { class: "dot big" });
   mark.style.background = css(hueColour(item.categoryIndex, theme.get() === "dark"));
   const section = (title: string, make: () => Promise<Child>): HTMLElement => {
@@ -88,7 +94,9 @@ function crops(context: MapContext, found: readonly Sighting[]): Child {
 }
 
 function classes(found: Record<string, number>): Child {
-  const rows = Object.entries(found).sort(([, one], [, two]) => two - one);
+  const rows = Object.entries(found)
+    .filter(([, value]) => value >= 0.01)
+    .sort(([, one], [, two]) => two - one);
   const most = Math.max(...rows.map(([, value]) => value), 1e-9);
   return h(
     "ul",
