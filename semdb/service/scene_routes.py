@@ -10,7 +10,8 @@ from fastapi import Query, Request
 from starlette.responses import Response
 
 from semdb.api import Database
-from semdb.service import schemas, values
+from semdb.service import scene_schemas as schemas
+from semdb.service import values
 from semdb.service.answers import as_json, encoded, tagged
 from semdb.service.keyframe_routes import keyframe_of
 from semdb.service.roles import READ
