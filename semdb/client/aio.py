@@ -119,6 +119,14 @@ class AsyncDatabase:
         """As `RemoteDatabase.keyframes`."""
         return await self._run(self.database.keyframes, map, recording, **options)
 
+    async def get(self, path: str, **parameters: Any) -> Any:
+        """As `RemoteDatabase.get`."""
+        return await self._run(self.database.get, path, **parameters)
+
+    def pages(self, path: str, **parameters: Any) -> AsyncIterator[Any]:
+        """As `RemoteDatabase.pages`, for ``async for``."""
+        return self._each(lambda: self.database.pages(path, **parameters))
+
     async def load(self, keyframe: Keyframe, *what: str) -> Keyframe:
         """The keyframe, with its ``image``, ``depth``, ``objects``, ``keypoints``, or all, read and kept."""
         for name in what or ("image", "depth", "objects", "keypoints"):

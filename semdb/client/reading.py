@@ -182,6 +182,17 @@ class Reading:
         """The columns of each table and view that `sql` can ask."""
         return {name: tuple(columns) for name, columns in self._get("/v1/tables")["tables"].items()}
 
+    def get(self, path: str, **parameters: Any) -> Any:
+        """The JSON of any address of the service that begins with a slash: what no method here has.
+
+        `parameters` are those of the query. Raises SemdbError.
+        """
+        return self._get(path, **parameters)
+
+    def pages(self, path: str, **parameters: Any) -> Iterator[Any]:
+        """The items of a list of the service as JSON has them, page by page. Raises SemdbError."""
+        return self._pages(path, **parameters)
+
     def _get(self, path: str, **parameters: Any) -> Any:
         given = {name: _text(value) for name, value in parameters.items() if value is not None}
         return self._transport.json("GET", path, params=given)

@@ -311,7 +311,11 @@ def test_cameras_are_so_many_and_let_go_when_nothing_comes(served: Served, frame
         full = small.client.post("/v1/maps/office/sessions", json={})
         assert (full.status_code, int(full.headers["retry-after"]) >= 1) == (429, True)
         assert small.client.delete(f"/v1/sessions/{second['session']}").json() == {"ended": True}
-        with connect(f"ws{small.url.removeprefix('http')}{first['stream']}") as stream, pytest.raises(ConnectionClosed):
+        address = f"ws{small.url.removeprefix('http')}{first['stream']}"
+        with connect(address), connect(address), pytest.raises(InvalidStatus) as flooded:
+            connect(address)
+        assert flooded.value.response.status_code == 429
+        with connect(address) as stream, pytest.raises(ConnectionClosed):
             stream.recv(timeout=30)  # nothing comes of it, so it ends
         deadline = time.monotonic() + 20
         while len(small.service.sessions) and time.monotonic() < deadline:

@@ -6,6 +6,7 @@ import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import pytest
@@ -57,6 +58,21 @@ def test_every_command_of_the_page_works(served: Served) -> None:
             if "token revoke" in command:
                 assert [token for token in served.database.tokens() if token.revoked_at is None] == []
     assert ran > 30
+
+
+def test_every_program_of_the_page_works(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They stand in the order in which they can be run, beside what curl asks."""
+    monkeypatch.chdir(served.folder)
+    monkeypatch.delenv("SEMDB_TOKEN", raising=False)
+    names: dict[str, Any] = {}
+    programs = blocks(PAGE, ("py",))
+    for program in programs:
+        exec(compile(program.replace("http://127.0.0.1:8765", served.url), "page", "exec"), names)
+    names["db"].close()
+    assert len(programs) > 8
+    assert (names["found"].verdict, len(names["several"])) == (names["anywhere"].verdict, 2)
+    assert [job["state"] for job in names["jobs"]] == ["done"]
+    assert served.database.keyframe(1).id == 1  # it was not confirmed
 
 
 def test_the_page_names_every_route() -> None:

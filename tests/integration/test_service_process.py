@@ -166,8 +166,8 @@ def test_servers_answer_as_the_library_and_plan_for_workers(
         opening().ingest(room, map="office", stride=12)
         accounts.execute(server_url, plan.statements)
         try:
-            settings = ServeSettings(ingest_roots=str(room.parent))
-            with running(opening(reader_url=plan.urls["reader"]), settings) as served:
+            settings = ServeSettings(ingest_roots=str(room.parent), sql_rows=3)
+            with running(opening(reader_url=plan.urls["reader"], sql_time_limit_s=0.5), settings) as served:
                 form, files = form_of(frames[6], depth=True)
                 found = served.client.post("/v1/maps/office/localize", data=form, files=files).json()
                 wanted = served.database.localize(frames[6], map="office", name="frame")
@@ -175,6 +175,11 @@ def test_servers_answer_as_the_library_and_plan_for_workers(
                 assert found["covariance"] == wanted.covariance.tolist()
                 rows = served.client.get("/v1/sql", params={"sql": "SELECT name FROM recordings"})
                 assert rows.json()["rows"] == [["room"]], rows.text
+                endless = {"sql": f"SELECT SUM(a.score) FROM {', '.join(f'objects {name}' for name in 'abcdefghij')}"}
+                ended = served.client.get("/v1/sql", params=endless)
+                assert (ended.status_code, "longer than 0.5 s" in ended.json()["detail"]) == (422, True), ended.text
+                more = served.client.get("/v1/sql", params={"sql": "SELECT a.id FROM objects a, objects b"})
+                assert (len(more.json()["rows"]), more.json()["truncated"]) == (3, True)
                 token = served.database.create_token("read")
                 with served.with_token(token.secret) as client:
                     for statement in ("SELECT * FROM access_tokens", "SELECT source FROM `recordings`"):
