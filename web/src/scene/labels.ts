@@ -3,6 +3,7 @@ import type { Vector3 } from "../types";
 import { h } from "../ui/h";
 
 export interface Label {
+  id: number;
   key: string;
   text: string;
   at: Vector3;

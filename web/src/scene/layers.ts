@@ -105,6 +105,16 @@ export function cloudPoints(cloud: PointCloud, size: number): Points {
   return made;
 }
 
+/** Dots of so many pixels. */
+export function dots(places: readonly Vector3[], colours: readonly Rgb[], size: number): Points {
+  const geometry = new BufferGeometry();
+  geometry.setAttribute("position", new BufferAttribute(new Float32Array(places.flat()), 3));
+  geometry.setAttribute("color", new BufferAttribute(new Float32Array(colours.flatMap((paint) => linear(paint))), 3));
+  const made = new Points(geometry, new PointsMaterial({ size, sizeAttenuation: false, vertexColors: true }));
+  made.frustumCulled = false;
+  return made;
+}
+
 const TO_LINEAR = Uint8Array.from({ length: 256 }, (_, i) => Math.round(255 * new Color().setRGB(i / 255, 0, 0, SRGBColorSpace).r));
 
 /** Where each recording went: keyframes in the order of their frames. */

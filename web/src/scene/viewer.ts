@@ -3,6 +3,7 @@ import {
   type BufferGeometry,
   type Camera,
   Color,
+  Group,
   type LineBasicMaterial,
   type LineSegments,
   type Material,
@@ -21,7 +22,7 @@ import { type KeyframeItem, type LandmarkItem, type MapScene, type PointCloud, c
 import type { Vector3 } from "../types";
 import { colour, theme } from "../ui/theme";
 import { type Label, Labels } from "./labels";
-import { boxLines, cloudPoints, corners, ellipsoids, floorGrid, frustumLines, lines, linkLines, trails } from "./layers";
+import { boxLines, cloudPoints, corners, dots, ellipsoids, floorGrid, frustumLines, lines, linkLines, trails } from "./layers";
 import { hitBox } from "./pick";
 
 export const LAYERS = ["points", "cameras", "landmarks", "names", "trails", "links", "uncertainty", "grid"] as const;
@@ -31,6 +32,9 @@ export type Picked = { kind: "keyframe"; id: number } | { kind: "landmark"; id: 
 
 const MOVING_POINTS = 25_000;
 const REST_MS = 220;
+/** So many frusta and boxes have edges, at rest and while the view moves; of all others there are dots. */
+const EDGES = { rest: 1500, moving: 250 };
+const MOST_LABELLED = 600;
 
 export interface ViewerOptions {
   picked: (what: Picked) => void;
@@ -59,6 +63,8 @@ export class Viewer {
   private readonly extras = new Map<string, Object3D>();
   private readonly hidden = new Set<Layer>();
   private points: Points | null = null;
+  private edges: { edges: LineSegments; vertices: number }[] = [];
+  private labelled: Label[] = [];
   private cloud: PointCloud | null = null;
   private selection: Object3D[] = [];
   private chosenLandmarks = new Set<number>();
@@ -76,8 +82,9 @@ export class Viewer {
     readonly scene: MapScene,
     private readonly options: ViewerOptions,
   ) {
-    this.renderer = new WebGLRenderer({ antialias: true, powerPreference: "high-performance" });
-    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+    const software = isSoftware();
+    this.renderer = new WebGLRenderer({ antialias: !software, powerPreference: "high-performance" });
+    this.renderer.setPixelRatio(software ? 1 : Math.min(devicePixelRatio, 2));
     const canvas = this.renderer.domElement;
     canvas.tabIndex = 0;
     canvas.setAttribute("role", "application");
@@ -134,11 +141,17 @@ export class Viewer {
     const dark = theme.get() === "dark";
     this.world.background = new Color(colour("--scene"));
     const size = this.frustumSize();
-    this.put("cameras", frustumLines(scene.keyframes, size, this.recordingColours(), scene.keyframes.length > 400 ? 0.5 : 0.9));
-    this.put("landmarks", boxLines(scene.landmarks.filter(present), (item) => hueColour(item.categoryIndex, dark)));
+    this.edges = [];
+    const cameras = scattered(scene.keyframes);
+    const ofRecording = (item: KeyframeItem): [number, number, number] => hueColour(item.recordingIndex, dark);
+    this.putMany("cameras", frustumLines(cameras, size, cameras.map(ofRecording)), cameras, ofRecording, 16);
+    const things = scene.landmarks.filter(present).sort((a, b) => weight(b) - weight(a));
+    const ofClass = (item: LandmarkItem): [number, number, number] => hueColour(item.categoryIndex, dark);
+    this.putMany("landmarks", boxLines(things, ofClass), things, ofClass, 24);
+    this.labelled = this.makeLabels(dark, things);
     if (scene.keyframes.length > 1) this.put("trails", trails(scene, dark));
     if (scene.links.length > 0) this.put("links", linkLines(scene, colour("--scene-loop")));
-    if (scene.landmarks.length > 0) this.put("uncertainty", ellipsoids(scene.landmarks.filter(present), colour("--scene-sure")));
+    if (things.length > 0) this.put("uncertainty", ellipsoids(things.slice(0, EDGES.rest), colour("--scene-sure")));
     this.put("grid", floorGrid(scene, this.centre, this.radius, this.floor(), colour("--line-strong")));
     this.points = null;
     if (this.cloud && this.cloud.count > 0) {
@@ -154,9 +167,13 @@ export class Viewer {
     return Math.min(0.06, Math.max(0.006, 2.1 * this.radius / Math.sqrt(cloud.count)));
   }
 
-  private recordingColours(): [number, number, number][] {
-    const dark = theme.get() === "dark";
-    return this.scene.keyframes.map((item) => hueColour(item.recordingIndex, dark));
+  /** A layer of things with edges, and with dots where they are too many for that. */
+  private putMany<T extends { position: Vector3 }>(layer: Layer, edges: LineSegments, items: readonly T[], paint: (item: T) => [number, number, number], vertices: number): void {
+    const group = new Group();
+    group.add(edges);
+    this.edges.push({ edges, vertices });
+    if (items.length > EDGES.moving) group.add(dots(items.map((item) => item.position), items.map(paint), 4 * this.renderer.getPixelRatio()));
+    this.put(layer, group);
   }
 
   /** A camera that is none of the map's, by a name: a photo, or one that moves. `item` null takes it away. */
@@ -404,6 +421,10 @@ export class Viewer {
   private draw(): void {
     const began = performance.now();
     if (this.points && this.cloud) this.points.geometry.setDrawRange(0, this.moving ? Math.min(MOVING_POINTS, this.cloud.count) : this.cloud.count);
+    const most = this.moving ? EDGES.moving : EDGES.rest;
+    for (const { edges, vertices } of this.edges) edges.geometry.setDrawRange(0, most * vertices);
+    const paths = this.layers.get("trails");
+    if (paths) paths.visible = !this.hidden.has("trails") && !(this.moving && this.scene.keyframes.length > EDGES.rest);
     this.renderer.render(this.world, this.camera);
     this.drawLabels();
     this.frames.push(performance.now() - began);
@@ -422,20 +443,21 @@ export class Viewer {
       spot.project(this.camera);
       return spot.z > 1 || spot.z < -1 ? null : { x: ((spot.x + 1) / 2) * width, y: ((1 - spot.y) / 2) * height, far };
     };
-    const dark = theme.get() === "dark";
-    this.labels.draw(this.labelled(dark), project, width, height);
+    const chosen = this.chosenLandmarks;
+    const shown = this.hidden.has("landmarks") ? [] : this.labelled.filter((label) => !chosen.has(label.id));
+    const first = this.labelled.filter((label) => chosen.has(label.id)).map((label) => ({ ...label, weight: 1e6 }));
+    this.labels.draw([...first, ...shown.slice(0, MOST_LABELLED)], project, width, height);
   }
 
-  private labelled(dark: boolean): Label[] {
-    return this.scene.landmarks
-      .filter((item) => (present(item) && !this.hidden.has("landmarks")) || this.chosenLandmarks.has(item.id))
-      .map((item) => ({
-        key: String(item.id),
-        text: item.category,
-        at: plus(item.position, scaled(this.scene.up, item.size[2] / 2 + 0.02)),
-        colour: css(hueColour(item.categoryIndex, dark)),
-        weight: this.chosenLandmarks.has(item.id) ? 1e6 : item.probability * (1 + Math.cbrt(item.size[0] * item.size[1] * item.size[2])),
-      }));
+  private makeLabels(dark: boolean, things: readonly LandmarkItem[]): Label[] {
+    return things.map((item) => ({
+      id: item.id,
+      key: String(item.id),
+      text: item.category,
+      at: plus(item.position, scaled(this.scene.up, item.size[2] / 2 + 0.02)),
+      colour: css(hueColour(item.categoryIndex, dark)),
+      weight: weight(item),
+    }));
   }
 
   // picking
@@ -487,6 +509,26 @@ export class Viewer {
       return { x: ((spot.x + 1) / 2) * width, y: ((1 - spot.y) / 2) * height };
     });
   }
+}
+
+/** How much a thing is worth to be named: sure and large ones first. */
+function weight(item: LandmarkItem): number {
+  return item.probability * (1 + Math.cbrt(item.size[0] * item.size[1] * item.size[2]));
+}
+
+/** The same in an order of which every beginning is spread over all. */
+function scattered<T>(items: readonly T[]): T[] {
+  const step = 7919; // a prime
+  return items.length % step === 0 ? [...items] : items.map((_, i) => items[(i * step) % items.length] as T);
+}
+
+/** Whether pictures are drawn by the processor, as in machines without a graphics card. */
+function isSoftware(): boolean {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  const about = gl?.getExtension("WEBGL_debug_renderer_info");
+  const name = gl && about ? String(gl.getParameter(about.UNMASKED_RENDERER_WEBGL)) : "";
+  gl?.getExtension("WEBGL_lose_context")?.loseContext();
+  return /swiftshader|llvmpipe|software|basic render/i.test(name);
 }
 
 export function present(item: LandmarkItem): boolean {

@@ -107,6 +107,7 @@ class MapView implements Updatable {
       return;
     }
     const { viewer } = this;
+    Object.assign(viewer.element, { viewer }); // for those who measure
     viewer.canvas.setAttribute("aria-label", `${texts.map.scene(this.name)}. ${texts.map.sceneKeys}`);
     fill(this.stage, viewer.element, this.bar, this.legend);
     for (const layer of LAYER_NAMES) viewer.show(layer, !this.off.has(layer));
