@@ -26,6 +26,7 @@ echo "database: $SEMDB_DATABASE_URL"
 step synth "$out/room" --frames "$frames"
 step recording "$out/room"
 step ingest "$out/room" --map room --keyframes "$keyframes"
+step refine --map room --step landmarks
 step status
 
 step sql "SELECT category, COUNT(*) AS seen, COUNT(DISTINCT keyframe_id) AS keyframes, ROUND(AVG(keypoints)) AS keypoints

@@ -43,6 +43,8 @@ export const texts = {
       ["/", "search"],
       ["g then m", "maps"],
       ["g then s", "SQL"],
+      ["v", "a map in 3D or from above"],
+      ["h", "show all of a map"],
       ["t", "dark or light"],
       ["Esc", "close, or let go of what is selected"],
     ] as [string, string][],

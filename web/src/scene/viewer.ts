@@ -164,7 +164,7 @@ export class Viewer {
 
   /** About as large as points are apart. */
   private pointSize(cloud: PointCloud): number {
-    return Math.min(0.06, Math.max(0.006, 2.1 * this.radius / Math.sqrt(cloud.count)));
+    return Math.min(0.06, Math.max(0.006, 2.5 * this.radius / Math.sqrt(cloud.count)));
   }
 
   /** A layer of things with edges, and with dots where they are too many for that. */
