@@ -3,8 +3,8 @@
 ``python -m bench.trajectory RECORDING... [--every N] [--refined DIR] [--json FILE]``. Absolute trajectory error after
 rigid alignment (RMSE and median) and relative pose error over a second, of all frames with a pose; milliseconds per
 frame, decoding included for semdb and left out for the peers; and processor time, of all threads, as many times as SURF
-alone takes, which other work on the machine changes little. Closures are checked against the truth, and wrong ones are
-injected.
+alone takes, which other work on the machine changes little. Compiled kernels are loaded before. Closures are checked
+against the truth, and wrong ones are injected.
 
 The truth is what the recording says; ``--refined DIR`` compares with poses that pycolmap refined (some minutes for each
 recording; kept in DIR and found again there). Open3D is measured where it is installed (``semdb[bench]``).
@@ -36,6 +36,7 @@ from semdb.trajectory.recording import find_recorded, times_of
 from semdb.types import FloatArray
 
 SURF_FRAMES = 40
+WARMING_FRAMES = 30
 
 
 def main() -> None:
@@ -56,6 +57,7 @@ def main() -> None:
 
 def measure(recording: Recording, every: int, refined: Path | None, *, peers: bool) -> dict[str, Any]:
     """All methods on one recording."""
+    warm_up(recording)
     started, began = time.perf_counter(), time.process_time()
     found = find_recorded(recording, every=every)
     cpu = (time.process_time() - began) / len(found.entries)
@@ -84,6 +86,11 @@ def measure(recording: Recording, every: int, refined: Path | None, *, peers: bo
         "methods": rows,
         "closures": asdict(closure_figures(trajectory, recording, entries, true, times_s)) if known.all() else None,
     }
+
+
+def warm_up(recording: Recording) -> None:
+    """Loads compiled kernels, or compiles them, which is no time of a frame: a few frames from all of the way."""
+    find_recorded(recording, every=max(1, len(recording.entries) // WARMING_FRAMES))
 
 
 def row(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from semdb.cli.options import JsonFlag, Overrides, open_database, settings_options
-from semdb.shown import measure
+from semdb.shown import for_shell, measure
 
 if TYPE_CHECKING:
     from semdb.api import Database
@@ -71,7 +71,7 @@ def command(
     else:
         if dry_run or not report.convinced:
             print_keyframes(report)
-        print_lines(*as_lines(report, dry_run=dry_run))
+        print_lines(*as_lines(report, name, dry_run=dry_run))
     if not report.convinced:
         raise typer.Exit(1)
 
@@ -104,8 +104,8 @@ def row(one: AlignedKeyframe) -> tuple[Any, ...]:
     return (one.keyframe, frame, one.verdict, "yes" if one.agrees else "", one.inliers, *shown)
 
 
-def as_lines(report: AlignReport, *, dry_run: bool = False) -> list[str]:
-    """The evidence, and what was done, for people."""
+def as_lines(report: AlignReport, name: str | None = None, *, dry_run: bool = False) -> list[str]:
+    """The evidence, and what was done, for people. `name` is the one that the recording has in the map, if another."""
     names = ", ".join(report.recordings)
     lines = [
         f"localized  {report.localized} of {len(report.keyframes)} keyframes of {names} in the map {report.map}",
@@ -121,7 +121,11 @@ def as_lines(report: AlignReport, *, dry_run: bool = False) -> list[str]:
         lines.append(f"map        its keyframes {moved} by {measure(report.map_shift_m, 4)} m at most")
     if dry_run:
         return [*lines, f"would move from {report.from_map} to {report.map}; nothing is changed"]
-    return [*lines, f"moved from {report.from_map} to {report.map}; back again: semdb align --undo"]
+    lines.append(f"moved from {report.from_map} to {report.map}")
+    back = [for_shell(["semdb", "align", one, "--map", report.map, "--undo"]) for one in report.recordings]
+    if name is not None:
+        back = [for_shell(["semdb", "align", name, "--map", report.map, "--undo"])]
+    return [*lines, *(f"{'' if n else 'back again':<11}{text}" for n, text in enumerate(reversed(back)))]
 
 
 def as_json(report: AlignReport) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import secrets
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -77,6 +77,11 @@ def move_within(connection: Connection, wanted: Move, token: str) -> int:
         hold(connection, one)
     rows = _present(connection, {**wanted.relied_on, **wanted.before})
     _hold_poses(connection, rows)
+    say_moved(connection, [*(row.recording_id for row in rows.values()), *(r.recording_id for r in wanted.recordings)])
+    if wanted.counted is not None and _held(connection, wanted.map_id) != wanted.counted:
+        raise DatabaseError(
+            f"keyframes came into the map {there!r}, or left it, meanwhile, nothing is changed: run it again"
+        )
     for one in wanted.recordings:
         _check_recording(connection, one, wanted, rows)
         if one.map_id != wanted.map_id:
@@ -155,6 +160,27 @@ def _hold_poses(connection: Connection, rows: Mapping[int, Any]) -> None:
         high = {f"high_{name}": value + SAME for name, value in numbers.items()}
         if connection.execute(held, {"of_keyframe": key, **low, **high}).rowcount != 1:
             raise DatabaseError(f"keyframe {key} was deleted or moved meanwhile, nothing is changed: run it again")
+
+
+def say_moved(connection: Connection, recording_ids: Iterable[int]) -> None:
+    """Writes the rows of `pose_sources` anew, as they are: of the recordings that a move moves or relies on.
+
+    Nodes of a cluster do not wait for each other's rows, and what is updated to what it is, is no change that they tell
+    each other of. So two moves that must not both happen have to write one row: the second to commit is run again then.
+    """
+    for key in sorted(set(recording_ids)):
+        there = select(pose_sources).where(pose_sources.c.recording_id == key)
+        row = connection.execute(there).mappings().one_or_none()
+        connection.execute(delete(pose_sources).where(pose_sources.c.recording_id == key))
+        said = source_row(RecordingPoses()) if row is None else dict(row)
+        connection.execute(insert(pose_sources), {**said, "recording_id": key})
+
+
+def _held(connection: Connection, map_id: int) -> int:
+    """How many keyframes the map has, with those that others have committed since this transaction began to read."""
+    k = keyframes.c
+    there = k.recording_id.in_(select(recordings.c.id).where(recordings.c.map_id == map_id))
+    return int(connection.execute(update(keyframes).where(there).values(frame_index=k.frame_index)).rowcount)
 
 
 def _check_recording(connection: Connection, one: MovedRecording, wanted: Move, rows: Mapping[int, Any]) -> None:

@@ -126,7 +126,8 @@ class Move:
 
     `before` and `after` ``[4, 4]`` by keyframe id: the poses that were read, and those to be. `covariances` ``[6, 6]``
     replace those of the keyframes that have any here; others that move lose theirs. `relied_on` are poses of keyframes
-    that stay, and from which it was found out where the others go.
+    that stay, and from which it was found out where the others go. `counted` is how many keyframes the map had when all
+    of it was read to be moved: none may come in meanwhile, which would be left behind.
     """
 
     kind: OperationKind
@@ -138,3 +139,4 @@ class Move:
     covariances: Mapping[int, FloatArray] = field(default_factory=dict)
     parameters: Mapping[str, Any] = field(default_factory=dict)
     relied_on: Mapping[int, FloatArray] = field(default_factory=dict)
+    counted: int | None = None

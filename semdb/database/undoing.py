@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import partial
 from typing import Any
 
@@ -14,7 +14,7 @@ from semdb.database import checked, retry
 from semdb.database.ids import new_id
 from semdb.database.keyframe_rows import pose_of
 from semdb.database.links import matrix_blob, matrix_of
-from semdb.database.moving import SAME, chunks, hold, put_poses, put_source
+from semdb.database.moving import SAME, chunks, hold, put_poses, put_source, say_moved
 from semdb.database.pose_records import (
     LinkKind,
     MovedRecording,
@@ -109,6 +109,9 @@ def _undo(connection: Connection, operation: PoseOperation, mine: list[bool]) ->
     if operation.recording_id is not None:
         hold(connection, MovedRecording(operation.recording_id, operation.map_id, "", np.eye(4)))
     poses = _before(connection, operation)
+    _say_moved(connection, poses)
+    if operation.recording_id is None:
+        _refuse_before_later(connection, operation)
     map_id = operation.map_id
     if operation.recording_id is not None and operation.from_map_id != operation.map_id:
         map_id = _map_before(connection, operation)
@@ -150,6 +153,27 @@ def _before(connection: Connection, operation: PoseOperation) -> dict[int, Float
             )
         found[int(row.keyframe_id)] = before
     return found
+
+
+def _refuse_before_later(connection: Connection, operation: PoseOperation) -> None:
+    """Raises UsageError where a recording came into the map after its keyframes had moved: it lies as they lie now."""
+    c, r = pose_operations.c, recordings.c
+    there = c.recording_id.in_(select(r.id).where(r.map_id == operation.map_id))
+    later = [c.map_id == operation.map_id, c.id > operation.id, c.undone_at.is_(None), there]
+    # an update sees what others have committed since this transaction began to read
+    if connection.execute(update(pose_operations).where(*later).values(undone_at=None)).rowcount == 0:
+        return
+    names = select(r.name, c.id).join(recordings, r.id == c.recording_id).where(*later).order_by(c.id.desc())
+    row = connection.execute(names).first()
+    which = "a recording" if row is None else f"the recording {row.name!r} (operation {row.id})"
+    raise UsageError(f"{which} was laid on the keyframes of operation {operation.id} since: take that back first")
+
+
+def _say_moved(connection: Connection, moved: Iterable[int]) -> None:
+    k, keys = keyframes.c, set[int]()
+    for some in chunks(sorted(moved)):
+        keys |= set(connection.execute(select(k.recording_id).where(k.id.in_(some)).distinct()).scalars())
+    say_moved(connection, keys)
 
 
 def _late(

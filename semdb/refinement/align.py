@@ -144,6 +144,7 @@ def align_recordings(
     options = options or SessionOptions()
     names = _check(store, recordings, target, name)
     mine = _Side([h for one in recordings for h in store.keyframe_heads(one.map_id, one.recording_id)])
+    counted = len(store.keyframe_ids(target.id))
     theirs = _Side(store.keyframe_heads(target.id, bad=store.left_out))
     answers = _localized(store, mine, target, settings, progress, say)
     claims = _claims(answers, mine, theirs)
@@ -169,7 +170,7 @@ def align_recordings(
     report = replace(report, map_shift_m=max(shift, default=0.0))
     if dry_run:
         return report
-    wanted = _move(recordings, names, target, mine, theirs, consensus, placed, report, joint=joint)
+    wanted = _move(recordings, names, target, mine, theirs, consensus, placed, report, counted if joint else None)
     return replace(report, operation=move(store.engine, wanted))
 
 
@@ -342,12 +343,12 @@ def _move(
     consensus: Consensus,
     placed: Placed,
     report: AlignReport,
-    *,
-    joint: bool,
+    counted: int | None,
 ) -> Move:
+    """`counted`: keyframes of the map, where these move too."""
     motion = consensus.map_from_recording
     assert motion is not None
-    sides = [(mine, placed.poses, placed.covariances)]
+    joint, sides = counted is not None, [(mine, placed.poses, placed.covariances)]
     if joint:
         sides.append((theirs, placed.map_poses, placed.map_covariances))
     before = {head.id: head.world_from_camera for side, _, _ in sides for head in side.heads}
@@ -374,6 +375,7 @@ def _move(
         links=links,
         covariances={key: value for key, value in spread.items() if np.isfinite(value).all() and value.any()},
         relied_on=anchors,
+        counted=counted,
         parameters=evidence,
     )
 

@@ -38,6 +38,7 @@ class PoseResult:
     after: Mapping[int, FloatArray]
     covariances: Mapping[int, FloatArray]
     links: tuple[Link, ...]
+    counted: int  # keyframes of the map
     token: str  # tells a commit whose answer was lost from one that did not happen
 
 
@@ -88,6 +89,7 @@ class PoseStep:
                 )
                 for edge in edges
             ),
+            counted=len(listed),
             token=secrets.token_hex(8),
         )
 
@@ -100,6 +102,7 @@ class PoseStep:
             result.after,
             links=result.links,
             covariances=result.covariances,
+            counted=result.counted,
         )
         move_within(connection, wanted, result.token)
         return len(result.after)

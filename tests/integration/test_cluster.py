@@ -1,6 +1,6 @@
-"""Clusters of three nodes on loopback: ingest through all of them, one killed, one back and equal.
+"""A cluster of three nodes on loopback: ingest through all of them, one killed, one back and equal.
 
-Galera of MariaDB, where each node takes writes, and group replication of MySQL, where one does and another is elected.
+Group replication of MySQL, where one node takes writes and another is elected. Galera's is in test_galera.py.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ from tests.integration.comparison import content, is_complete, rows_per_table, s
 from tests.rooms import render, semdb
 
 LONGEST_GAP_S = 30.0
-LONGEST_GAP_OF_GALERA_S = 15.0
 FRAMES = 120
 OPTIONS = IngestOptions(stride=1, map_name="m")
 SPECS = {"SEMDB_DETECTOR": "recorded", "SEMDB_ENCODER": "gist", "SEMDB_FEATURES": "orb"}
@@ -39,26 +38,17 @@ def settings(url: str) -> Settings:
     return Settings(database_url=url, detector="recorded", encoder="gist", features="orb", threads=1)
 
 
-@pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    options = SyntheticOptions(frames=FRAMES, width=96, height=72, lap_frames=90)
-    return render(tmp_path_factory.mktemp("cluster") / "room", options)
+def small_room(folder: Path) -> Path:
+    return render(folder / "room", SyntheticOptions(frames=FRAMES, width=96, height=72, lap_frames=90))
 
 
-@pytest.fixture(scope="module")
-def undisturbed(small: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
+@contextlib.contextmanager
+def ingested(room: Path, folder: Path) -> Iterator[Store]:
     """All frames, ingested without any fault."""
-    url = f"sqlite:///{tmp_path_factory.mktemp('undisturbed') / 'a.sqlite3'}"
-    ingest_recordings([small], settings(url), OPTIONS)
+    url = f"sqlite:///{folder / 'a.sqlite3'}"
+    ingest_recordings([room], settings(url), OPTIONS)
     with open_store(url) as store:
         yield store
-
-
-@pytest.fixture
-def galera() -> Iterator[clusters.Galera]:
-    with clusters.galera() as made:
-        make_schema(made)
-        yield made
 
 
 @pytest.fixture
@@ -160,36 +150,16 @@ def check_equal(cluster: clusters.Cluster) -> None:
     assert sums[0] == sums[1] == sums[2]
 
 
-def test_a_node_of_galera_is_killed_and_returns(galera: clusters.Galera, small: Path, undisturbed: Store) -> None:
-    with open_store(galera.url(0)) as store:
-        with watched(galera, 1) as watch, ingesting(galera, small) as wrong:
-            reach(store, 15, wrong)
-            galera.nodes[1].kill()
-        assert max(watch.gaps) < LONGEST_GAP_OF_GALERA_S
-        assert content(store) == content(undisturbed)
-    galera.rejoin(galera.nodes[1])
-    check_equal(galera)
-    one_node_that_is_alive_is_enough(galera)
-
-
-def one_node_that_is_alive_is_enough(cluster: clusters.Cluster) -> None:
-    port, alive = services.free_port(), cluster.nodes[2]
-    with open_store(alive.url().replace("@", f"@127.0.0.1:{port},")) as store:
-        assert isinstance(store.maps(), list)
-        assert store.url == f"mysql+pymysql://semdb_test:***@127.0.0.1:{port},127.0.0.1:{alive.port}/semdb"
-
-
-def test_a_group_of_mysql_changes_its_primary_and_loses_it(
-    group: clusters.Group, small: Path, undisturbed: Store
-) -> None:
+def test_a_group_of_mysql_changes_its_primary_and_loses_it(group: clusters.Group, tmp_path: Path) -> None:
+    room = small_room(tmp_path)
     first, second, third = group.nodes
     first.execute(
         f"CREATE USER writer@'127.0.0.1' IDENTIFIED BY '{group.password}'",
         "GRANT SELECT, INSERT, UPDATE, DELETE ON semdb.* TO writer@'127.0.0.1'",
         f"GRANT SELECT ON {MEMBERS_TABLE} TO writer@'127.0.0.1'",  # as docs/scaling.md has it
     )
-    with open_store(group.url(0)) as store:
-        with watched(group, 0) as watch, ingesting(group, small) as wrong:
+    with open_store(group.url(0)) as store, ingested(room, tmp_path) as undisturbed:
+        with watched(group, 0) as watch, ingesting(group, room) as wrong:
             reach(store, 10, wrong)
             group.elect(second)  # the first goes on, and takes no writes any more
             reach(store, 40, wrong)

@@ -275,6 +275,8 @@ def test_a_move_that_cannot_be_changes_nothing(store: Store) -> None:
     few = {key: good.before[key] for key in ids[1:]}
     with pytest.raises(DatabaseError, match="were stored or deleted meanwhile, nothing is changed"):
         move(store.engine, replace(good, before=few, after={key: good.after[key] for key in few}))
+    with pytest.raises(DatabaseError, match="keyframes came into the map 'room', or left it, meanwhile"):
+        move(store.engine, replace(good, counted=4))
     with pytest.raises(NotFoundError, match="there is no map with the id 9999"):
         move(store.engine, replace(good, map_id=9999))
     wild = {**good.after, ids[0]: np.full((4, 4), np.nan)}
@@ -307,6 +309,24 @@ def test_later_moves_are_taken_back_first(store: Store) -> None:
     assert undo(store.engine, second) == len(ids)
     assert undo(store.engine, first) == len(ids)
     assert store.keyframe_ids(source) == ids
+
+
+def test_what_was_laid_on_moved_keyframes_is_taken_back_first(store: Store) -> None:
+    map_id, first_id, _ = fill(store)
+    before = poses_of(store, map_id, first_id)
+    move(store.engine, Move(OperationKind.REFINE, map_id, before, {key: MOTION @ one for key, one in before.items()}))
+    source, recording_id, ids = fill_estimated(store)
+    move(store.engine, wanted(store, map_id, recording_id, source))
+    later, first = list_operations(store.engine, map_id)
+    as_it_is = everything(store)
+    with pytest.raises(
+        UsageError, match=rf"'own' \(operation {later.id}\) was laid on the keyframes of operation {first.id} since"
+    ):
+        undo(store.engine, first)
+    assert everything(store) == as_it_is
+    assert undo(store.engine, later) == len(ids)
+    assert undo(store.engine, first) == len(before)
+    assert poses_of(store, map_id, first_id).keys() == before.keys()
 
 
 def test_links_are_copied_with_their_map(store: Store, tmp_path: Path) -> None:
