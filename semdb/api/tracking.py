@@ -12,6 +12,7 @@ import numpy as np
 
 from semdb.api.localizing import Localizing, read_frame
 from semdb.errors import FrameError, UsageError
+from semdb.geometry import FARTHEST_POSE_M
 
 if TYPE_CHECKING:
     from semdb.door.tracked import Tracked
@@ -261,6 +262,11 @@ def _checked(odometry: FloatArray | None) -> FloatArray | None:
     if odometry is None:
         return None
     pose = np.asarray(odometry, np.float64)
-    if pose.shape != (4, 4) or not np.isfinite(pose).all() or abs(np.linalg.det(pose[:3, :3]) - 1) > 1e-3:
+    good = pose.shape == (4, 4) and bool((np.abs(pose) <= FARTHEST_POSE_M).all())
+    if good:
+        turn = pose[:3, :3]
+        rigid = np.abs(turn.T @ turn - np.eye(3)).max() < 1e-3 and np.linalg.det(turn) > 0
+        good = bool(rigid and np.array_equal(pose[3], [0, 0, 0, 1]))
+    if not good:
         raise UsageError("odometry is a rigid pose [4, 4], odom_from_camera in metres")
     return pose

@@ -37,7 +37,7 @@ from semdb.service.middleware import check_depth, tell
 from semdb.service.problems import Problem, busy, not_found, problem_of
 from semdb.service.roles import LOCALIZE
 from semdb.service.routing import MapName, Table
-from semdb.service.signing import opened, signed
+from semdb.service.signing import LONGEST, opened, signed
 from semdb.service.state import Service, access_of, gone, service_of
 from semdb.service.tracked import Common, FrameGiven, numbers_of, open_tracker, pose_of, track
 
@@ -78,11 +78,13 @@ async def open_session(
     texts = None if body.categories is None else json.dumps(body.categories)
     who = access_of(request).who
     common = Common(secrets.token_hex(8), who, map, body.camera, body.like, body.depth_scale, texts)
+    seconds = service.settings.session_hours * 3600
+    name = signed(service.secret, KIND, asdict(common), seconds)
+    if len(name) > LONGEST:
+        raise Problem(422, "what the frames have in common is too long for an address: give categories with each frame")
     async with service.sessions.use(common.id) as live:
         await service.localizing.run(lambda: open_tracker(service.database, live, common), lambda: gone(request))
         live.opened = True
-    seconds = service.settings.session_hours * 3600
-    name = signed(service.secret, KIND, asdict(common), seconds)
     address = f"/v1/sessions/{name}"
     content = {
         "session": name,

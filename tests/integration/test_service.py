@@ -291,6 +291,10 @@ def test_what_sessions_refuse(served: Served, frames: list[Frame]) -> None:
     for odometry in ("1,2", "nan,0,0,1,0,0,0", "0,0,0,2,0,0,0", "x"):
         answer = served.client.post(opened.json()["frames"], data={"odometry": odometry}, files=files)
         assert (answer.status_code, "odometry" in answer.json()["detail"]) == (422, True), answer.text
+    form, files = form_of(frames[6])
+    for odometry in ("1e300,0,0,1,0,0,0", ",".join(["1"] * 16), "1,0,0,0,0,1,0,0,0,0,1,0,5,5,5,9"):
+        answer = served.client.post(opened.json()["frames"], data=form | {"odometry": odometry}, files=files)
+        assert (answer.status_code, "rigid pose" in answer.json()["detail"]) == (422, True), answer.text
     for session in ("none", opened.json()["session"][:-4] + "AAAA"):
         assert served.client.post(f"/v1/sessions/{session}/frames", files=files).status_code == 404
         with pytest.raises(InvalidStatus) as refused:
@@ -300,6 +304,8 @@ def test_what_sessions_refuse(served: Served, frames: list[Frame]) -> None:
         connect(address, origin="https://evil.example")
     assert served.client.post("/v1/maps/office/sessions", json={"depth": 1}).status_code == 422
     assert served.client.post("/v1/maps/office/sessions", json={"like": "/etc"}).status_code == 422
+    long = {"categories": {str(number): "chair" * 10 for number in range(1, 200)}}
+    assert "too long for an address" in served.client.post("/v1/maps/office/sessions", json=long).json()["detail"]
     assert served.client.post("/v1/maps/attic/sessions", json={}).status_code == 404
 
 
