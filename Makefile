@@ -58,6 +58,7 @@ services:
 	@scripts/install-services.sh
 
 test: $(VENV)/.stamp-dev services lint
+	@if command -v npm >/dev/null; then $(MAKE) --silent web/node_modules/.stamp; fi
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
 test-long: $(VENV)/.stamp-dev services

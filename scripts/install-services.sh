@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # The servers that the tests run on loopback: MariaDB with Galera, Redis and nginx from the distribution, and a MySQL in a
-# folder of its own (install-mysql.sh); zsh, to press TAB in it; node, to build the page of the service. Tests on other
+# folder of its own (install-mysql.sh); zsh, to press TAB in it; node, to build the page of the service, and Chromium to look at it. Tests on other
 # servers name them in SEMDB_TEST_MARIADB_URL and SEMDB_TEST_MYSQL_URL; those that kill servers, and those of a cluster, need
 # them here.
 set -euo pipefail
@@ -14,6 +14,7 @@ command -v rsync >/dev/null || packages+=(rsync)
 command -v redis-server >/dev/null || packages+=(redis-server)
 command -v zsh >/dev/null || packages+=(zsh)
 command -v nginx >/dev/null || packages+=(nginx-light)
+[ -n "${SEMDB_TEST_CHROMIUM:-}" ] || command -v chromium >/dev/null || packages+=(chromium)
 { command -v node && command -v npm; } >/dev/null || packages+=(nodejs npm)
 
 if [ ${#packages[@]} -gt 0 ] && ! "$here/apt-install.sh" "${packages[@]}"; then

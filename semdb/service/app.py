@@ -26,6 +26,7 @@ from semdb.service import (
     ingest_routes,
     job_routes,
     keyframe_routes,
+    live_routes,
     localize_routes,
     log_routes,
     map_routes,
@@ -51,6 +52,7 @@ TABLES = (
     ingest_routes.table,
     log_routes.table,
     job_routes.table,
+    live_routes.table,
 )
 ABOUT = """Maps, recordings, keyframes and things of a visual semantic database, and where images were taken.
 

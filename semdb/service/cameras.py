@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import secrets
 import threading
 import time
+from collections import deque
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
@@ -14,6 +16,7 @@ from semdb.door.protocol import CameraTracker
 from semdb.service.problems import busy
 
 MOST_WAITING = 4  # frames of one camera
+MOST_PLACES = 300  # of its path that are kept
 
 
 @dataclass(eq=False)
@@ -28,6 +31,27 @@ class Live:
     turn: asyncio.Lock = field(default_factory=asyncio.Lock)
     running: threading.Lock = field(default_factory=threading.Lock)  # also of those whose client went away meanwhile
     last: tuple[bytes | None, dict[str, Any]] | None = None
+    map: str | None = None
+    name: str = field(default_factory=lambda: secrets.token_hex(4))  # as others see it; says nothing of the session
+    path: deque[list[float]] = field(default_factory=lambda: deque(maxlen=MOST_PLACES))
+
+    def saw(self, map_name: str, answer: dict[str, Any]) -> None:
+        """What those who watch are shown of an answer: the pose, and where the camera came from."""
+        self.map = map_name
+        if answer.get("pose") is not None:
+            self.path.append([round(float(value), 4) for value in answer["pose"]["position"]])
+
+    def shown(self, now: float) -> dict[str, Any]:
+        """The camera for those who watch."""
+        answer = {} if self.last is None else self.last[1]
+        kept = ("state", "pose", "covariance", "confidence", "reason", "timestamp_ns", "frame_index")
+        return {
+            "camera": self.name,
+            "frames": self.frames,
+            "age_s": round(max(0.0, now - self.used_s), 2),
+            "path": list(self.path),
+            **{key: answer.get(key) for key in kept},
+        }
 
 
 class Sessions:
@@ -61,6 +85,13 @@ class Sessions:
             live.used_s = time.monotonic()
             if live.tracker is None and not live.waiting:
                 self.end(name)
+
+    def watched(self, map_name: str) -> list[dict[str, Any]]:
+        """The cameras that move in a map, the one that moved last first."""
+        now = time.monotonic()
+        found = [live for live in self._live.values() if live.map == map_name and live.last is not None]
+        fresh = [live for live in found if live.waiting or now - live.used_s < self._idle_s]
+        return [live.shown(now) for live in sorted(fresh, key=lambda live: -live.used_s)]
 
     def end(self, name: str) -> None:
         """Lets a camera go."""

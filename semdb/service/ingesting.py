@@ -110,7 +110,7 @@ class Jobs:
     def _work(self, job: Job) -> None:
         event("job", job=job.id, state="running", attempt=job.attempts)
         if job.attempts > MOST_ATTEMPTS:
-            self._database.end_job(job, FAILED, error="it was begun several times and never ended")
+            self._database.end_job(job, FAILED, error=job.error or "it was begun several times and never ended")
             return
         over = threading.Event()
         keeper = threading.Thread(target=self._keep, args=(job, over), daemon=True)
@@ -119,7 +119,7 @@ class Jobs:
             result = self._ingest(job)
         except (DatabaseUnavailableError, RecordingUnavailableError, _Stopped) as error:
             event("job", job=job.id, state="given back", error=str(error))
-            self._database.end_job(job, WAITING)
+            self._database.end_job(job, WAITING, error=scrubbed(error))
         except SemdbError as error:
             event("job", level=logging.ERROR, job=job.id, state="failed", error=str(error))
             self._database.end_job(job, FAILED, error=scrubbed(error))

@@ -356,6 +356,25 @@ class JobModel(Model):
     error: str | None
 
 
+class Watched(Model):
+    """A camera that is tracked: its last answer, and where it came from. `age_s`: so long ago its last frame came."""
+
+    camera: str = Field(examples=["9f2c51aa"])
+    frames: int
+    age_s: float
+    path: list[Vector3]
+    state: str
+    pose: Pose | None
+    covariance: Matrix | None
+
+
+class LiveCameras(Model):
+    """The cameras that this process tracks in a map."""
+
+    map: str
+    cameras: list[Watched]
+
+
 class Source(Model):
     """What may be ingested: its `path` below one of the folders that are set."""
 

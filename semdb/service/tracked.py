@@ -92,6 +92,7 @@ def track(database: Database, live: Live, common: Common, given: FrameGiven) -> 
         own = {"frame_index": given.frame_index, "timestamp_ns": given.timestamp_ns, "frames": live.frames}
         found = tracked_dict(answer, notes=[scrubbed(line) for line in notes]) | own
         live.last = key, found
+        live.saw(common.map, found)
         return found
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -143,3 +144,29 @@ def test_jobs_are_listed_and_done_again(served: Served, room: Path) -> None:
     assert served.client.post("/v1/jobs/9999/retry").status_code == 404
     failures = asked(served, "/v1/maps/office/recordings/room/failures").json()
     assert failures == {"map": "office", "recording": "room", "failures": []}
+
+
+def test_cameras_that_are_tracked_are_seen_by_those_who_watch(served: Served, frames: list[Frame]) -> None:
+    assert asked(served, "/v1/maps/office/live").json() == {"map": "office", "cameras": []}
+    assert served.client.get("/v1/maps/attic/live").status_code == 404
+    session = served.client.post("/v1/maps/office/sessions", json={}).json()
+    poses = []
+    with served.client.stream("GET", "/v1/maps/office/live/events") as events:
+        lines = events.iter_lines()
+        for k in (4, 5):
+            form, files = form_of(frames[k], depth=True)
+            answer = served.client.post(session["frames"], data=form, files=files).json()
+            poses.append(answer["pose"]["position"])
+        while True:
+            line = next(lines)
+            if line.startswith("data: ") and '"frames":2' in line:
+                break
+    told = json.loads(line[6:])
+    assert told["map"] == "office"
+    [camera] = asked(served, "/v1/maps/office/live").json()["cameras"]
+    assert camera["frames"] == 2
+    assert camera["state"] == "tracking"
+    assert camera["path"] == told["cameras"][0]["path"] == [[round(value, 4) for value in pose] for pose in poses]
+    assert camera["camera"] not in session["session"]
+    served.client.delete(session["frames"].removesuffix("/frames"))
+    assert asked(served, "/v1/maps/office/live").json()["cameras"] == []

@@ -1,4 +1,5 @@
 import { token, tokenNeeded } from "./api";
+import { takeDrops } from "./drop";
 import { type Updatable, go, match } from "./router";
 import { routes } from "./routes";
 import { shell } from "./shell";
@@ -12,6 +13,7 @@ import { askForToken } from "./ui/token";
 followTheme();
 listenToKeys();
 followLinks();
+takeDrops();
 const main = shell();
 
 let ending = new AbortController();

@@ -10,6 +10,9 @@ import { askForToken } from "./ui/token";
 /** Pages of the head of the page: address, text, key after g. */
 export const PAGES: readonly [string, string, string][] = [
   ["/maps", texts.nav.maps, "m"],
+  ["/locate", texts.nav.locate, "p"],
+  ["/sql", texts.nav.sql, "s"],
+  ["/jobs", texts.nav.ingest, "i"],
 ];
 
 /** Builds it, and gives the element for views. */
