@@ -12,8 +12,12 @@ from semdb.cli.options import (
     AcceptOption,
     CameraOption,
     Overrides,
+    PoseBackboneOption,
+    PoseStepsOption,
+    PoseWeightsOption,
     Reading,
     open_database,
+    pose_options,
     reading_options,
     settings_options,
 )
@@ -53,8 +57,8 @@ def command(
         typer.Option(
             "--method",
             metavar="NAME",
-            help="semdb (default), cnn, paper, chen, sift-reference, oracle, colmap; NAME+depth gives queries their "
-            "depth; several on the same queries.",
+            help="semdb (default), cnn, paper, chen, sift-reference, oracle, colmap, posenet, posenet-4d, cnn-lstm, "
+            "middle-keyframe, mean-pose; NAME+depth gives queries their depth; several on the same queries.",
         ),
     ] = None,
     ablation: Annotated[
@@ -93,10 +97,18 @@ def command(
         Path | None,
         typer.Option("--trajectories", metavar="DIR", help="Write estimated and true poses in TUM's format (evo)."),
     ] = None,
+    pose_backbone: PoseBackboneOption = "frozen",
+    pose_weights: PoseWeightsOption = None,
+    pose_steps: PoseStepsOption = None,
+    pose_networks: Annotated[
+        Path | None,
+        typer.Option("--pose-networks", metavar="DIR", help="Networks of `semdb train pose`; new ones are kept there."),
+    ] = None,
 ) -> None:
     """Keyframes into a database of its own, other frames as queries, errors against the true poses."""
     from semdb.cli.progress import StagedProgress
     from semdb.evaluation.methods import ABLATION
+    from semdb.evaluation.regression import PoseTraining
     from semdb.evaluation.runner import EvaluateOptions
     from semdb.evaluation.worst import WORST
     from semdb.localization.acceptance import parse_tolerance
@@ -119,6 +131,7 @@ def command(
         query_from=tuple(query_from or ()),
         truth=truth,
         pictures=WORST if report is not None else 0,
+        training=PoseTraining(pose_options(pose_backbone, pose_weights, pose_steps), pose_networks),
     )
     check_outputs(json_file, report, trajectories)
     output = Outputs(json_file, report, trajectories, used_settings(settings, options), expects_several(paths, options))

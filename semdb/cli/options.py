@@ -5,7 +5,8 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, cast
 
 import typer
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from semdb.api import Database
     from semdb.recordings.options import ReadOptions
     from semdb.settings import Settings
+    from semdb.training.pose_options import PoseOptions
 
     Reading: TypeAlias = ReadOptions
 else:
@@ -75,6 +77,30 @@ AcceptOption = Annotated[
         help="Poses that differ by no more are one: ambiguous only if others fit as well.",
     ),
 ]
+
+PoseBackboneOption = Annotated[
+    str,
+    typer.Option(
+        "--pose-backbone",
+        metavar="NAME",
+        help="What networks that regress poses see with: frozen (the encoder, an onnx: file), resnet34, mobilenet_v2.",
+    ),
+]
+PoseWeightsOption = Annotated[
+    Path | None,
+    typer.Option("--pose-weights", metavar="FILE", help="Checkpoint that the backbone starts from; default: random."),
+]
+PoseStepsOption = Annotated[
+    int | None, typer.Option("--pose-steps", metavar="N", help="Steps of training of networks that regress poses.")
+]
+
+
+def pose_options(backbone: str, weights: Path | None, steps: int | None) -> PoseOptions:
+    """How networks that regress poses are trained. Raises UsageError."""
+    from semdb.training.pose_options import PoseOptions
+
+    usual = PoseOptions(backbone=backbone, weights=weights)
+    return usual if steps is None else replace(usual, steps=steps)
 
 
 def accepted(text: str | None) -> tuple[float, float] | None:

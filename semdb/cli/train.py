@@ -8,7 +8,13 @@ from typing import Annotated, TypeVar
 
 import typer
 
-from semdb.cli.options import load_settings
+from semdb.cli.options import (
+    PoseBackboneOption,
+    PoseStepsOption,
+    PoseWeightsOption,
+    load_settings,
+    pose_options,
+)
 from semdb.cli.output import print_lines
 from semdb.errors import UsageError
 
@@ -19,7 +25,7 @@ command = typer.Typer(help="Train the networks.", no_args_is_help=True, add_comp
 
 @command.callback()
 def group() -> None:
-    """Train the networks."""  # keeps `detector` a subcommand while it is the only one
+    """Train the networks."""
 
 
 @command.command("detector")
@@ -87,6 +93,48 @@ def train_detector(
         raise
     last = f", loss {sum(done.losses[-20:]) / len(done.losses[-20:]):.3f}" if done.losses else ""
     print_lines(f"{done.steps} steps{last}; curves in {done.curves}; use the detector as torchvision:{done.checkpoint}")
+
+
+@command.command("pose")
+def train_pose(
+    paths: Annotated[list[Path], typer.Argument(metavar="PATH...", help="Folders of recordings.")],
+    output: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the networks; see evaluate --pose-networks.")],
+    method: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--method", metavar="NAME", help="posenet (default), posenet-4d, cnn-lstm, or NAME-keyframes; several."
+        ),
+    ] = None,
+    keyframes: Annotated[int | None, typer.Option(metavar="N", help="As for the evaluation.")] = None,
+    max_queries: Annotated[int | None, typer.Option(metavar="N", help="As for the evaluation.")] = None,
+    pose_backbone: PoseBackboneOption = "frozen",
+    pose_weights: PoseWeightsOption = None,
+    pose_steps: PoseStepsOption = None,
+    encoder: Annotated[str | None, typer.Option(metavar="SPEC", help="Place encoder; over SEMDB_ENCODER.")] = None,
+    device: Annotated[str | None, typer.Option(metavar="NAME", help="Device; over SEMDB_DEVICE.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the networks in --output.")] = False,
+) -> None:
+    """Train networks that regress poses in the places of recordings, on frames that an evaluation does not ask about.
+
+    Keyframes and queries are chosen as `semdb evaluate` does with the same options.
+    """
+    from semdb.cli.progress import StagedProgress, say
+    from semdb.evaluation.regression import PoseTraining, train_networks
+
+    given = {name: value for name, value in (("encoder", encoder), ("device", device)) if value is not None}
+    settings = load_settings(**given)
+    training = PoseTraining(pose_options(pose_backbone, pose_weights, pose_steps), output)
+    with StagedProgress() as progress:
+        found = train_networks(
+            paths, tuple(method or ["posenet"]), training, settings, keyframes=keyframes, max_queries=max_queries,
+            resume=resume, progress=progress.update, say=say,
+        )  # fmt: skip
+        lines = [
+            f"{path}: {network.frames} frames, loss {sum(tail) / max(1, len(tail)):.3f}"
+            for path, network in found
+            for tail in (network.regressor.losses[-20:],)
+        ]
+    print_lines(*lines)
 
 
 def classes_of(coco: Path, split: str, text: str) -> tuple[str, ...] | None:

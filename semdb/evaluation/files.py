@@ -49,6 +49,7 @@ def to_json(result: EvaluationResult) -> dict[str, Any]:
         "other_errors": None if result.other_errors is None else asdict(result.other_errors),
         "disagreement": None if result.disagreement is None else asdict(result.disagreement),
         "nees": None if result.nees is None else asdict(result.nees),
+        "training_frames": result.training_frames,
         "per_query": [_query_to_json(query) for query in result.per_query],
     }
 

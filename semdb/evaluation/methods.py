@@ -10,13 +10,17 @@ from semdb.localization.localizer import LocalizerOptions
 from semdb.localization.matching import Evidence, MatchingOptions
 from semdb.localization.pose_options import PoseOptions
 from semdb.localization.verdict import VerdictOptions
+from semdb.training.pose_options import CNN_LSTM, POSENET, POSENET_4D
 
 SEMDB = "semdb"
 SIFT_REFERENCE = "sift-reference"
 ORACLE = "oracle"
 COLMAP = "colmap"
+MIDDLE_KEYFRAME, MEAN_POSE = "middle-keyframe", "mean-pose"
+TRIVIAL = (MIDDLE_KEYFRAME, MEAN_POSE)
+ON_KEYFRAMES = "-keyframes"  # after a network's name: it is trained on those of the map only
 WITH_DEPTH = "+depth"  # after a method's name: its queries come with their depth images
-COLOUR_ONLY = (SIFT_REFERENCE, COLMAP)
+COLOUR_ONLY = (SIFT_REFERENCE, COLMAP, *TRIVIAL)
 
 # As the papers accept a pose: enough inliers, nothing else is asked.
 _COUNT_ONLY = VerdictOptions(
@@ -35,13 +39,19 @@ _COUNT_ONLY = VerdictOptions(
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """`features` None takes those of the settings; `query_depth` gives queries their depth images."""
+    """`features` None takes those of the settings; `query_depth` gives queries their depth images.
+
+    `network` is the kind of a network that is trained in the place to regress poses, on the keyframes of the map only
+    with `keyframes_only`, and otherwise on all frames that are not near a query.
+    """
 
     name: str
     summary: str
     options: LocalizerOptions = field(default_factory=LocalizerOptions)
     features: str | None = None
     query_depth: bool = False
+    network: str | None = None
+    keyframes_only: bool = False
 
 
 # The filter as the paper has it: keyframes that share half of the query's objects, by counts, and no others.
@@ -58,6 +68,8 @@ _PAPER_FILTER = CoarseOptions(
 _HARD = replace(_PAPER_FILTER, filtered_batches=(1, 2, 3, 4))
 _CLASSLESS = MatchingOptions(contradiction_ratio=MatchingOptions().ratio)  # a pair of two classes is like any other
 _ON_OBJECTS = PoseOptions(matching=MatchingOptions(evidence=Evidence.OBJECTS), guided=False)
+
+_LEARNT = {False: "all frames that are not near a query", True: "the keyframes of the map"}
 
 METHODS = {
     method.name: method
@@ -143,8 +155,26 @@ METHODS = {
             "as semdb with keypoints on objects of the same class only",
             LocalizerOptions(pose=_ON_OBJECTS),
         ),
+        *(
+            Method(
+                kind + (ON_KEYFRAMES if keyframes_only else ""),
+                f"{what}, trained on {_LEARNT[keyframes_only]}",
+                query_depth=kind == POSENET_4D,
+                network=kind,
+                keyframes_only=keyframes_only,
+            )
+            for kind, what in (
+                (POSENET, "a network that regresses the pose of an image"),
+                (POSENET_4D, "the same from an image and its depth"),
+                (CNN_LSTM, "PoseNet with an LSTM over the frames before the query"),
+            )
+            for keyframes_only in (False, True)
+        ),
+        Method(MIDDLE_KEYFRAME, "the pose of the keyframe in the middle of the map, whatever the query shows"),
+        Method(MEAN_POSE, "the mean pose of the map's keyframes, whatever the query shows"),
     )
 }
+NETWORKS = tuple(name for name, method in METHODS.items() if method.network is not None)
 
 
 # What each layer brings: (filter, keypoints, method), in the order of the table of `--ablation`.
@@ -168,6 +198,8 @@ def method_named(name: str) -> Method:
         raise UsageError(f"--method {name}: known are {', '.join(METHODS)}, and with query depth NAME{WITH_DEPTH}")
     if name == plain:
         return METHODS[plain]
+    if plain in NETWORKS:
+        raise UsageError(f"--method {name}: {POSENET_4D} is the network that takes depth, and takes it by itself")
     if plain in COLOUR_ONLY:
         raise UsageError(f"--method {name}: {plain} has no use for the depth of queries")
     return replace(METHODS[plain], name=name, query_depth=True)

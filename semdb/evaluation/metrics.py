@@ -119,7 +119,7 @@ class EvaluationResult:
 
     `truth` is ``given`` or ``refined``: whose poses the map and the errors are of. `other_errors` are the errors of
     the same answers against the other truth, where it is known. `pictures` are JPEG files by recording and frame
-    index and are for reports only.
+    index and are for reports only. `training_frames` are those that a network learnt poses from.
     """
 
     recording: str
@@ -153,6 +153,7 @@ class EvaluationResult:
     other_errors: Errors | None = None
     disagreement: Disagreement | None = None
     nees: Nees | None = None
+    training_frames: int | None = None
     pictures: Mapping[tuple[str, int], bytes] = field(default_factory=dict, compare=False, repr=False)
 
 

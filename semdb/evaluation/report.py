@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from semdb.errors import UsageError
 from semdb.evaluation import html
 from semdb.evaluation.averages import averages
-from semdb.evaluation.comparisons import table_1, table_3, table_4
+from semdb.evaluation.comparisons import regression_grid, table_1, table_3, table_4
 from semdb.evaluation.confidence_plots import answers, confidence_plot, has_confidence, uncertainty_plot
 from semdb.evaluation.failures import explain, median_sharpness
 from semdb.evaluation.files import write_averages, write_json, write_queries_csv
@@ -19,6 +19,7 @@ from semdb.evaluation.methods import ABLATION, SEMDB
 from semdb.evaluation.metrics import EvaluationResult, QueryResult
 from semdb.evaluation.plots import cumulative_plot, figure_png, inlier_plot, series_names, timing_plot, trajectory_plot
 from semdb.evaluation.published import PAPER_TIMING_MS
+from semdb.evaluation.regression_plots import regression_plot
 from semdb.evaluation.tables import (
     HEADERS,
     ablation_grids,
@@ -70,7 +71,7 @@ def write_report(
         write_queries_csv(directory / "queries.csv", ordered)
         sections = [
             ("results", "Results", _summary(ordered)),
-            ("paper", "Beside the paper", _beside_the_paper(ordered)),
+            ("paper", "Beside the paper", _beside_the_paper(directory, ordered)),
             ("errors", "Figures 6 and 7: share of queries within an error", _curves(directory, ordered)),
             ("retrieval", "Retrieval", html.grid_html(retrieval_grid(ordered), heading=False)),
             ("time", "Time per query", _timing(directory, ordered)),
@@ -137,10 +138,18 @@ def _stages(result: EvaluationResult) -> str:
     return ", ".join(f"{stage} {count}" for stage, count in sorted(result.stages.items()))
 
 
-def _beside_the_paper(results: Sequence[EvaluationResult]) -> str:
-    return "\n".join(html.grid_html(grid) for grid in (table_3(results), table_4(results))) + html.folded(
-        table_1(results).title, "", html.grid_html(table_1(results), heading=False)
-    )
+def _beside_the_paper(directory: Path, results: Sequence[EvaluationResult]) -> str:
+    parts = [html.grid_html(grid) for grid in (table_3(results), table_4(results))]
+    measured = regression_grid(results)
+    if measured.rows:
+        parts.append(html.grid_html(measured))
+        known = dict.fromkeys(result.recording for result in results if result.training_frames is not None)
+        for number, recording in enumerate(known, start=1):
+            figure = regression_plot([result for result in results if result.recording == recording])
+            path = directory / f"training-{number}.png"
+            parts += [f"<h3>{for_html(recording)}</h3>", _figure(path, figure, f"frames to learn from, {recording}")]
+    parts.append(html.folded(table_1(results).title, "", html.grid_html(table_1(results), heading=False)))
+    return "\n".join(parts)
 
 
 def _curves(directory: Path, results: Sequence[EvaluationResult]) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from semdb.database.store import Store
@@ -12,6 +12,7 @@ from semdb.evaluation.colmap import load_pycolmap
 from semdb.evaluation.methods import COLMAP, SEMDB, Method, method_named
 from semdb.evaluation.metrics import EvaluationResult, QueryResult, summarise, with_other_truth
 from semdb.evaluation.protocols import PAPER, PROTOCOLS, evenly_spaced
+from semdb.evaluation.regression import PoseTraining, check_torch
 from semdb.evaluation.runs import Described, Describers, Run, open_run, read_frames
 from semdb.evaluation.splits import folder_plan, paper_plans, scene_plan, tell_apart
 from semdb.evaluation.tasks import GIVEN, REFINED, Plan, Task, refine_truth
@@ -38,6 +39,7 @@ class EvaluateOptions:
     Without `refine` the map stays as ingest makes it. `keyframes` are numbers to run one by one, None for what the
     protocol chooses. `map_from` and `query_from` are folders for protocol `split`. Poses within `accept` are one.
     `truth` is ``given``, ``refined`` or ``both``. `pictures` is how many of the worst queries are drawn.
+    `training` is how networks that regress poses are made.
     """
 
     methods: tuple[str, ...] = (SEMDB,)
@@ -54,6 +56,7 @@ class EvaluateOptions:
     query_from: tuple[Path, ...] = ()
     truth: str = GIVEN
     pictures: int = 0
+    training: PoseTraining = field(default_factory=PoseTraining)
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +130,8 @@ def check_options(paths: Sequence[Path], options: EvaluateOptions) -> list[Metho
             raise UsageError(f"--keyframes {count}: at least one keyframe is needed")
     if options.truth != GIVEN or any(method.name == COLMAP for method in methods):
         load_pycolmap()
+    for method in methods:
+        check_torch(method)
     by_name = options.map_from or options.query_from
     if by_name and paths:
         raise UsageError("give either folders to evaluate one by one, or --map-from and --query-from, not both")
@@ -195,6 +200,7 @@ def _open(
     return open_run(
         *(method, task, describers, store, options.coarse, options.query_depth, progress, options.accept),
         refine=options.refine,
+        training=options.training,
     )
 
 
@@ -250,6 +256,7 @@ def _result(task: Task, run: Run, found: Sequence[QueryResult], options: Evaluat
         query_recordings=tuple(part.recording.name for part in task.queries),
         truth=task.truth,
         disagreement=task.disagreement,
+        training_frames=run.training_frames,
     )
 
 

@@ -11,8 +11,18 @@ from semdb.errors import FrameError, RecordingError
 from semdb.evaluation.baselines import SiftReference, nearest_in_pose
 from semdb.evaluation.colmap_method import ColmapReference
 from semdb.evaluation.failures import sharpness
-from semdb.evaluation.methods import COLMAP, ORACLE, SIFT_REFERENCE, Method
+from semdb.evaluation.methods import COLMAP, ORACLE, SIFT_REFERENCE, TRIVIAL, Method
 from semdb.evaluation.metrics import QueryResult, query_result, with_reach
+from semdb.evaluation.regression import (
+    FIXED,
+    PoseTraining,
+    TrainedNetwork,
+    always,
+    fixed_pose,
+    keyframe_poses,
+    regressed,
+    trained_network,
+)
 from semdb.evaluation.retrieval import FIRST, reach
 from semdb.evaluation.tasks import Part, Task
 from semdb.ingestion.run import IngestOptions, ingest_recording
@@ -34,6 +44,7 @@ class Describers:
 
     def __init__(self, detector: str, encoder: str, features: str, settings: Settings) -> None:
         self._default = features
+        self.encoder = encoder
         self.settings = settings
         self._made = {features: describer_from_specs(detector, encoder, features, settings)}
 
@@ -69,6 +80,7 @@ class Run:
     """A method, ready to answer. `poses` ``[n, 4, 4]`` are those of its keyframes: the frames that could be read."""
 
     retrieves = True
+    training_frames: int | None = None
 
     def __init__(self, method: Method, models: tuple[ModelInfo, ...], poses: FloatArray) -> None:
         self.method = method
@@ -79,7 +91,7 @@ class Run:
         self, recording: str, frame: Frame, decode_ms: float, described: Described
     ) -> tuple[QueryResult, Localization]:
         """The result for one frame. `described` shares descriptions between the methods of one query."""
-        localization, timing = self.localize(frame, described)
+        localization, timing = self.localize(frame, described, recording)
         timing = {"decode": decode_ms, **timing, **localization.timing_ms}
         timing["total"] = decode_ms + timing.pop("describe") + timing.pop("localize")
         result = query_result(
@@ -98,7 +110,9 @@ class Run:
             result = with_reach(result, found, retrieves=self.retrieves)
         return result, localization
 
-    def localize(self, frame: Frame, described: Described) -> tuple[Localization, dict[str, float]]:
+    def localize(
+        self, frame: Frame, described: Described, recording: str = ""
+    ) -> tuple[Localization, dict[str, float]]:
         """The answer, and wall times; `describe` and `localize` among them, which are whole."""
         raise TypeError(f"{type(self).__name__} answers nothing")
 
@@ -138,7 +152,9 @@ class LocalizerRun(Run):
         description, milliseconds = described[key]
         return description, {"describe": milliseconds, **description.timing_ms}
 
-    def localize(self, frame: Frame, described: Described) -> tuple[Localization, dict[str, float]]:
+    def localize(
+        self, frame: Frame, described: Described, recording: str = ""
+    ) -> tuple[Localization, dict[str, float]]:
         description, timing = self.describe(frame, described)
         started = time.perf_counter()
         found = self._localizer.localize(description)
@@ -170,7 +186,9 @@ class OracleRun(LocalizerRun):
 
     retrieves = False
 
-    def localize(self, frame: Frame, described: Described) -> tuple[Localization, dict[str, float]]:
+    def localize(
+        self, frame: Frame, described: Described, recording: str = ""
+    ) -> tuple[Localization, dict[str, float]]:
         if frame.world_from_camera is None:
             raise FrameError(f"{frame.name}: oracle chooses keyframes by the true pose, and there is none")
         description, timing = self.describe(frame, described)
@@ -188,7 +206,9 @@ class ReferenceRun(Run):
         self.retrieves = isinstance(reference, ColmapReference)
         self._reference = reference
 
-    def localize(self, frame: Frame, described: Described) -> tuple[Localization, dict[str, float]]:
+    def localize(
+        self, frame: Frame, described: Described, recording: str = ""
+    ) -> tuple[Localization, dict[str, float]]:
         found = self._reference.localize(frame)
         features = found.timing_ms["features"]
         return found, {"describe": features, "localize": found.timing_ms["total"] - features}
@@ -198,6 +218,38 @@ class ReferenceRun(Run):
 
     def keyframe(self, position: int) -> tuple[str, int, tuple[Detection, ...]]:
         return *self._reference.names[position], ()
+
+
+class FixedRun(Run):
+    """The methods that give one pose to whatever is asked."""
+
+    retrieves = False
+
+    def __init__(self, method: Method, poses: FloatArray) -> None:
+        super().__init__(method, (), poses)
+        self._pose = fixed_pose(method, poses)
+
+    def localize(
+        self, frame: Frame, described: Described, recording: str = ""
+    ) -> tuple[Localization, dict[str, float]]:
+        return always(self._pose, FIXED, "the same for every query", 0.0), {"describe": 0.0, "localize": 0.0}
+
+
+class NetworkRun(Run):
+    """The methods that regress a pose. `retrieves` is false: no keyframe is looked for."""
+
+    retrieves = False
+
+    def __init__(self, method: Method, network: TrainedNetwork, poses: FloatArray) -> None:
+        super().__init__(method, network.models, poses)
+        self._network = network
+        self.training_frames = network.frames
+
+    def localize(
+        self, frame: Frame, described: Described, recording: str = ""
+    ) -> tuple[Localization, dict[str, float]]:
+        found, described_ms = regressed(self._network, recording, frame)
+        return found, {"describe": described_ms, "encode": described_ms, "localize": found.timing_ms["total"]}
 
 
 def open_run(
@@ -211,8 +263,15 @@ def open_run(
     accept: Tolerance | None = None,
     *,
     refine: bool = True,
+    training: PoseTraining | None = None,
 ) -> Run:
     """The method on the keyframes of `task`, which go into `store` unless another method brought them there."""
+    if method.name in TRIVIAL:
+        return FixedRun(method, keyframe_poses(task))
+    if method.network is not None:
+        own = describers.encoder, describers.settings
+        network = trained_network(method, task, training or PoseTraining(), *own, progress)
+        return NetworkRun(method, network, keyframe_poses(task))
     if method.name in (SIFT_REFERENCE, COLMAP):
         frames = [name_and_frame[:2] for name_and_frame in read_frames(task.keyframes)]
         if not frames:

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from semdb.errors import UsageError
 from semdb.evaluation.averages import averages
-from semdb.evaluation.comparisons import table_1, table_3, table_4
+from semdb.evaluation.comparisons import regression_grid, table_1, table_3, table_4
 from semdb.evaluation.confidence_plots import answers, confidence_plot
 from semdb.evaluation.failures import explain, sharpness
 from semdb.evaluation.methods import ABLATION
@@ -35,6 +35,7 @@ from semdb.evaluation.plots import (
 )
 from semdb.evaluation.published import PAPER_TABLE_3
 from semdb.evaluation.refined_truth import Disagreement
+from semdb.evaluation.regression_plots import regression_plot
 from semdb.evaluation.report import write_report
 from semdb.evaluation.tables import (
     HEADERS,
@@ -312,13 +313,41 @@ def test_sequences_of_the_paper_stand_below_its_rows() -> None:
     assert grid.rows[6][5] == "0.0300 / 0.90"
     assert len(table_3([kt0, result(recording="desk")]).rows) == len(PAPER_TABLE_3) + 2
     rooms = table_4([kt0, kt1])
-    assert rooms.rows[-1] == ("semdb, this run", "0.1100 / 2.20 (2 of 4)", "-")
+    assert rooms.rows[-1][:3] == ("semdb, this run", "0.1100 / 2.20 (2 of 4)", "-")
+    assert rooms.rows[-1][3:] == ("0.0300 / 0.90 (2 of 4)", "-")
+    assert rooms.rows[0] == ("PoseNet", "0.6000 / 3.64", "0.4600 / 2.97", "-", "-")
     other = replace(kt0, truth="refined", keyframes_asked=12, mean_translation_m=0.5)
-    assert table_4([kt0, other]).rows[-2:] == [
+    assert [row[:3] for row in table_4([kt0, other]).rows[-2:]] == [
         ("semdb, this run", "0.1100 / 2.20 (1 of 4)", "-"),
         ("semdb (refined poses), this run, 12 keyframes each", "0.5000 / 2.20 (1 of 4)", "-"),
     ]
     assert table_1([kt0]).rows[-1] == ("ICL-NUIM living room kt0", "this run", "250", "25", "10")
+
+
+def test_networks_stand_beside_structure_with_what_they_learnt_from() -> None:
+    few, many = (
+        replace(
+            result("posenet"), training_frames=frames, mean_translation_m=mean, mean_rotation_deg=9.0,
+            median_translation_m=0.3, recall={**result().recall, "0.3m": 0.25},
+        )
+        for frames, mean in ((25, 0.55), (180, 0.22))
+    )  # fmt: skip
+    fixed = replace(result("mean-pose"), mean_translation_m=1.1)
+    grid = regression_grid([result(), few, many, fixed, result(recording="desk")])
+    assert [row[:4] for row in grid.rows] == [
+        ("room", "semdb", "25", "-"),
+        ("room", "posenet", "25", "25"),
+        ("room", "posenet", "25", "180"),
+        ("room", "mean-pose", "25", "-"),
+    ]
+    assert grid.rows[1][4:] == ("0.5500 / 9.00", "0.3000 / 0.90", "25.0 %", "5.0")
+    assert [row[-1] for row in grid.rows] == ["1.0", "5.0", "2.0", "10.0"]
+    assert regression_grid([result(), fixed]).rows == []
+    [axes] = regression_plot([result(), few, many, fixed]).axes
+    [line, *levels] = axes.lines
+    assert list(line.get_xdata()) == [25, 180]
+    assert list(line.get_ydata()) == [0.55, 0.22]
+    assert [level.get_ydata()[0] for level in levels] == pytest.approx([0.11, 1.1])
 
 
 def test_averages_are_plain_means_over_recordings() -> None:

@@ -115,6 +115,7 @@ def test_json_has_exactly_the_contract_keys_and_no_nan() -> None:
         "recording", "protocol", "method", "models", "frames", "keyframes", "queries", "localized",
         "false_localizations", "success_rate", "median_translation_m", "median_rotation_deg", "mean_translation_m",
         "mean_rotation_deg", "recall", "ranked_share", "keyframes_matched", "stages", "timing_ms", "per_query",
+        "training_frames",
         "sequence", "keyframes_asked", "query_depth", "map_recordings", "query_recordings", "retrieval", "truth",
         "coarse", "other_errors", "disagreement", "nees",
     }  # fmt: skip

@@ -16,7 +16,10 @@ Environment = Mapping[str, str]
 MOST_NAMES = 200
 _PATHS = re.compile(r"\b(PATH|FILE|FOLDER|DIR|IMAGE)\b")  # words of metavars
 EXPORTS = ("tum", "colmap", "kapture", "ply", "mcap", "rrd", "landmarks", "g2o", "semdb")
-METHODS = ("semdb", "cnn", "paper", "chen", "sift-reference", "oracle", "colmap")
+METHODS = (
+    *("semdb", "cnn", "paper", "chen", "sift-reference", "oracle", "colmap"),
+    *("posenet", "posenet-4d", "cnn-lstm", "middle-keyframe", "mean-pose"),
+)
 FIXED: Mapping[str, Entries] = {
     "--features": (("surf", "SURF, 64 dimensions"), ("sift", "SIFT"), ("orb", "ORB, binary")),
     "--device": (("auto", "the best there is"), ("cpu", ""), ("cuda", ""), ("mps", "Metal")),
