@@ -32,6 +32,12 @@ IGNORED = 1e6  # times the noise: no weight
 FIXED = 1e-7  # a standard deviation (m, rad) that nothing moves
 MOST_LOOSER = 3.0  # times the usual prior that a keyframe's own standard deviation makes of it, or a third
 LEAST_DISTANCE = 0.02  # of a keyframe from the query (`pose_distances`), for the prior on its pose
+RECORDED_POSITION, RECORDED_ROTATION = 1.05, 1.9  # fitted on freiburg1_rpy and the red kitchen
+USUAL_TURN, SEEN_TURN = (
+    0.0058,
+    0.0017,
+)  # rad: of recorded poses at a distance of 1, and what is no noise of its estimate
+MOST_EVIDENT = 10.0  # times the prior on a keyframe's pose that recorded poses may show to be off
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +94,7 @@ class BundleResult:
     shift: FloatArray  # [c, 6] steps that the images have made from their start
     chi2: FloatArray  # [k] squared pixel residual over its variance
     iterations: int
+    recorded_sigma: tuple[float, float] = (0.0, 0.0)  # m and rad: see `_recorded_sigma`
 
 
 @dataclass(slots=True)
@@ -127,6 +134,7 @@ class _Solver:
         self.information = np.zeros((self.images, 9))  # of the priors
         self.drift = np.ones((self.images, 9))  # how many times the priors' sigma each unknown has
         self.expected = np.zeros((self.images, 9))  # by the priors
+        self.apart = np.zeros((self.images - 1, 2))  # distances of the keyframes, for place and turn
         if problem.expected_turn is not None:
             self.expected[:, 6:] = problem.expected_turn
 
@@ -137,6 +145,7 @@ class _Solver:
         keyframes = np.stack([invert_pose(pose) for pose in self.problem.keyframe_from_world])
         distance = pose_distances(invert_pose(camera_from_world), keyframes)
         self.drift[1:, :6] = np.sqrt(np.maximum(distance, LEAST_DISTANCE))[:, None]
+        self.apart[:] = np.maximum(distance, LEAST_DISTANCE)[:, None]
 
     def doubting(self, prior: MotionPrior) -> None:
         """Takes into account how sure the pose of each keyframe is, where that is known: against others of which it is
@@ -147,6 +156,7 @@ class _Solver:
         times = self.problem.keyframe_sigma / [prior.keyframe_m, prior.keyframe_rad]
         known = np.clip(np.where(np.isfinite(times), times, 1.0), 1 / MOST_LOOSER, MOST_LOOSER)
         self.drift[1:, :6] *= np.repeat(known, 3, axis=1)
+        self.apart *= known
 
     def believe(self, sigma: FloatArray) -> None:
         """Makes `sigma` ``[3]`` (shift, rotation, turn of an image) those of the priors. The query's pose has none."""
@@ -281,14 +291,21 @@ def adjust(
         return _result(state, blocks, iterations, None)
     solver.believe_depth(state)
     sigma = _evident_sigma(solver, state, blocks, least, greatest)
+    recorded = _recorded_sigma(solver, state, blocks, sigma, least, greatest)
     solver.believe(sigma)
     state, blocks, more = solver.minimise(state, max_iterations)
     shown = 1 - (least / np.maximum(sigma, FIXED)) ** 2  # what is least is not known to be there at all
     covariance = _covariance(solver, blocks, state.poses[QUERY], np.tile(np.repeat(shown, 3), count))
-    return _result(state, blocks, iterations + more, covariance)
+    return _result(state, blocks, iterations + more, covariance, recorded)
 
 
-def _result(state: _State, blocks: _Blocks, iterations: int, covariance: FloatArray | None) -> BundleResult:
+def _result(
+    state: _State,
+    blocks: _Blocks,
+    iterations: int,
+    covariance: FloatArray | None,
+    recorded: tuple[float, float] = (0.0, 0.0),
+) -> BundleResult:
     return BundleResult(
         camera_from_world=state.poses[QUERY],
         points=state.points,
@@ -298,7 +315,27 @@ def _result(state: _State, blocks: _Blocks, iterations: int, covariance: FloatAr
         shift=state.shift,
         chi2=blocks.chi2,
         iterations=iterations,
+        recorded_sigma=recorded,
     )
+
+
+def _recorded_sigma(
+    solver: _Solver, state: _State, blocks: _Blocks, sigma: FloatArray, least: FloatArray, greatest: FloatArray
+) -> tuple[float, float]:
+    """How far (m, rad) a pose that was recorded where the query is would be off what the images show.
+
+    Keyframes are off each other's images by so much for every unit of distance; what the nearest is away, it is off.
+    `sigma` is what was found of it where no more than `greatest` is believed.
+    """
+    evident = sigma
+    if (sigma[:2] >= greatest[:2]).any() and (greatest[:2] > least[:2]).all():
+        evident = _evident_sigma(solver, state, blocks, least, greatest * [MOST_EVIDENT, MOST_EVIDENT, 1.0])
+    shown = np.sqrt(np.maximum(evident[:2] ** 2 - least[:2] ** 2, 0.0))
+    # a few keyframes tell little of how they turned: in part it is what recordings show on the whole, if it is there
+    doubt = 0.5 * shown[1] ** 2 / (shown[1] ** 2 + SEEN_TURN**2)
+    shown[1] *= (USUAL_TURN / max(shown[1], FIXED)) ** doubt
+    metres, radians = shown * solver.apart.min(axis=0) * [RECORDED_POSITION, RECORDED_ROTATION]
+    return float(metres), float(radians)
 
 
 def _evident_sigma(

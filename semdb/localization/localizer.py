@@ -38,6 +38,7 @@ from semdb.localization.pose import (
     find_rival,
     first_pose,
     match_views,
+    recorded_covariance,
 )
 from semdb.localization.pose_options import PoseOptions
 from semdb.localization.search import Search, best_pairs, evidence_of, numbers_of
@@ -376,7 +377,7 @@ class Localizer:
             verdict=judgement.verdict,
             map_name=self.map_name,
             world_from_camera=None if pose is None else pose.world_from_camera,
-            covariance=None if pose is None else pose.covariance,
+            covariance=coarse.covariance if coarse is not None else recorded_covariance(estimate),
             confidence=judgement.confidence,
             inliers=0 if search.estimate is None else search.estimate.inliers,
             stage=search.stage,

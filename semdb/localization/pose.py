@@ -81,6 +81,7 @@ class PoseEstimate:
     residual_px: float  # median reprojection error of the inliers
     spread: float  # 0..1: share of a 4x4 grid over the image that holds inliers
     aligned: int = 0  # pairs whose patches are alike to a fraction of a pixel; 0 without images
+    recorded_sigma: tuple[float, float] = (0.0, 0.0)  # m and rad that poses recorded here are off, beyond `covariance`
     seen: Alignment | None = None  # where the query shows `pairs`, to a fraction of a pixel where patches were aligned
 
 
@@ -199,7 +200,15 @@ def estimate_pose(
         return None
     keep = error < options.inlier_px
     aligned = int(np.count_nonzero(seen.found))
-    return replace(estimate, aligned=aligned, seen=Alignment(seen.xy[keep], seen.found[keep]))
+    recorded = refined.recorded_sigma
+    return replace(estimate, aligned=aligned, recorded_sigma=recorded, seen=Alignment(seen.xy[keep], seen.found[keep]))
+
+
+def recorded_covariance(estimate: PoseEstimate | None) -> FloatArray | None:
+    """``[6, 6]`` of the pose in the frame of the recorded poses: what images leave open, and how far these are off."""
+    if estimate is None or estimate.covariance is None:
+        return None
+    return estimate.covariance + np.diag(np.repeat(estimate.recorded_sigma, 3) ** 2)
 
 
 def _joined_pose(

@@ -232,3 +232,17 @@ def test_images_move_by_the_exponential(size: float) -> None:
     step[0, :6] = random.normal(size=6) * size
     expected = pose_from(so3_exp(step[0, 3:6]), step[0, :3]) @ pose
     np.testing.assert_allclose(move_images(pose[None], step)[0], expected, atol=1e-12)
+
+
+def test_how_far_recorded_poses_are_off_is_read_off_the_keyframes() -> None:
+    def shown(error: float) -> list[float]:
+        found = []
+        for seed in range(6):
+            problem, truth = problem_of(seed, keyframes=6, keyframe_error=error, pixel_noise=0.4)
+            found.append(adjust(problem, moved_a_little(truth)).recorded_sigma[0])
+        return found
+
+    exact, off, far_off = shown(0.0), shown(0.012), shown(0.036)
+    assert max(exact) < 0.0005
+    assert 0.002 < np.median(off) < 0.02  # beyond the 6 mm that the adjustment itself believes
+    assert 2 < np.median(far_off) / np.median(off) < 4
