@@ -107,8 +107,15 @@ class Settings(BaseSettings):
     metrics_port: int | None = Field(
         None, ge=1, le=65535, description="a worker serves Prometheus metrics on this port; default: not at all"
     )
-    descriptor_dtype: Literal["float32", "float16"] = Field(
-        "float32", description="how descriptors of float are stored; float16 takes half the room"
+    descriptor_dtype: Literal["auto", "float32", "float16", "uint8"] = Field(
+        "auto",
+        description="how descriptors of float are stored: float32, float16 (half the room), uint8 (a quarter). auto: "
+        "as the map has them, uint8 in a new one",
+    )
+    keep_images: Literal["original", "jpeg", "none"] = Field(
+        "original",
+        description="what is kept of image files: original, jpeg (colour as JPEG where that is smaller), none (small "
+        "grey images that localization needs, no depth)",
     )
     check_recordings: bool = Field(
         True, description="an ingest looks first whether a recording's images fit what it says of itself"

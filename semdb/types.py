@@ -119,7 +119,7 @@ class Features:
     angle: Float32Array  # [n] degrees, -1 where the feature has none
     response: Float32Array  # [n]
     laplacian: npt.NDArray[np.int8]  # [n] -1, 0 (unknown) or 1
-    descriptors: npt.NDArray[np.generic]  # [n, d] float32, or uint8 for binary features
+    descriptors: npt.NDArray[np.generic]  # [n, d] float32, uint8 of bits, int8 (byte_descriptors)
 
     def __len__(self) -> int:
         return len(self.xy)

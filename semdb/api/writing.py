@@ -13,6 +13,7 @@ from semdb.errors import DatabaseUnavailableError, SemdbError, UsageError
 from semdb.names import storable
 
 if TYPE_CHECKING:  # the rooms behind are entered when something is asked of them: they take a second to import
+    from semdb.database.compacting import Compacted
     from semdb.database.copying import Copied
     from semdb.database.pose_records import PoseOperation
     from semdb.door.protocol import Source
@@ -308,6 +309,38 @@ class Writing(Reading):
         if map is not None:
             return store.delete_map(store.find_map(map).id, progress)
         raise UsageError("say what to delete: map=, recording= or keyframes=")
+
+    def compact(
+        self,
+        map: str,
+        *,
+        dtype: str | None = "uint8",
+        keep_images: str = "original",
+        dry_run: bool = False,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> Compacted:
+        """Rewrites the rows of a map smaller, a keyframe at a time; one stopped anywhere goes on where it was.
+
+        Descriptors that take more room become `dtype` (``uint8``, ``float16``; None: as they are) and keypoints beside
+        them 16 bytes each, images what `keep_images` says, as `SEMDB_KEEP_IMAGES`. Nothing of it can be taken back.
+        Damaged keyframes are told of, and stay. Raises NotFoundError, UsageError.
+        """
+        from semdb.database.compacting import SMALLER, compact_map
+        from semdb.recordings.kept_images import KINDS, ORIGINAL, kept_images
+
+        if dtype is not None and dtype not in SMALLER:
+            raise UsageError(f"descriptors become smaller as {' or '.join(SMALLER)}, not as {dtype!r}")
+        if keep_images not in KINDS:
+            raise UsageError(f"what is kept of images is {', '.join(KINDS)}, not {keep_images!r}")
+        store = self._store()
+
+        def kept(rgb: bytes, depth: bytes | None, name: str) -> tuple[bytes, bytes | None]:
+            return kept_images(rgb, depth, keep_images, name)
+
+        return compact_map(
+            store.engine, store.find_map(map).id, dtype, None if keep_images == ORIGINAL else kept,
+            dry_run=dry_run, bad=store.left_out, progress=progress,
+        )  # fmt: skip
 
     def evaluate(
         self, paths: Sequence[Path], options: EvaluateOptions | None = None, *, progress: Progress | None = None

@@ -20,7 +20,7 @@ command = typer.Typer(
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")]
 
 
-def confirm(question: str, yes: bool) -> None:
+def confirm(question: str, yes: bool, kept: str = "nothing was deleted") -> None:
     """Ask on the terminal unless `yes`. Raises `UsageError` where nobody can answer, `typer.Exit` for a no."""
     import sys
 
@@ -31,7 +31,7 @@ def confirm(question: str, yes: bool) -> None:
     if not sys.stdin.isatty():
         raise UsageError(f"{question} Nobody can answer here: give --yes")
     if not typer.confirm(for_terminal(question), err=True):
-        print_lines("nothing was deleted")
+        print_lines(kept)
         raise typer.Exit(1)
 
 

@@ -33,6 +33,7 @@ COMMANDS: dict[str, str] = {
     "retry": "semdb.cli.status:retry",
     "delete": "semdb.cli.delete",
     "refine": "semdb.cli.refine",
+    "compact": "semdb.cli.compact",
     "align": "semdb.cli.align",
     "find": "semdb.cli.find",
     "changes": "semdb.cli.changes",

@@ -42,6 +42,8 @@ def _kind(blob: bytes) -> str | None:
         return f"mask {header.size[0]}x{header.size[1]}"
     if header.magic == codecs.COMPACT_MAGIC:
         return f"compact keypoints {header.dtype}[{shape}]"
+    if header.magic == codecs.BYTES_MAGIC:
+        return f"descriptors {header.dtype}[{shape}]"
     return f"{'vector' if len(header.shape) == 1 else 'array'} {header.dtype}[{shape}]"
 
 

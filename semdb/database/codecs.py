@@ -5,6 +5,7 @@ all other bytes (4), shape (4 each), data in C order. A mask (magic ``SDBM``) is
 uint16 array: height, width, then the lengths of the runs of the row-major mask, the first run being background; a run
 of more than 65535 pixels is several with runs of 0 between. Before there was version 2, which knows uint16, masks were
 of uint32, and those of images with a side above 65535 still are. Keypoints may be compact: `semdb.database.compact`.
+Descriptors of float that are stored as bytes (magic ``SDBQ``) are uint8, 128 more than `semdb.byte_descriptors` has.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 from isal.isal_zlib import crc32
 
+from semdb.byte_descriptors import are_bytes, to_bytes
 from semdb.database.checked import MOST_PIXELS
 from semdb.database.checked import blob as checked_blob
 from semdb.database.compact import compact, expand
@@ -29,11 +31,14 @@ from semdb.types import BoolArray, Features, Float32Array, Int64Array, IntArray,
 ARRAY_MAGIC = b"SDBA"
 MASK_MAGIC = b"SDBM"
 COMPACT_MAGIC = b"SDBK"
+BYTES_MAGIC = b"SDBQ"
+ZERO = 128  # the byte that stands for zero
 VERSION = 2
 LONGEST_RUN = 65535
 KEYPOINT_COLUMNS = ("x", "y", "size", "angle", "response", "laplacian", "X", "Y", "Z")
 
 _HEADER = struct.Struct("<4sBBBBI")
+HEAD = _HEADER.size
 _CHECKED = 8  # bytes of the header before the checksum
 _DTYPES: dict[int, np.dtype[Any]] = {
     1: np.dtype("<f4"),
@@ -187,6 +192,46 @@ def decode_mask(blob: bytes, where: str, size: tuple[int, int] | None = None) ->
     return np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(height, width)
 
 
+def encode_descriptors(descriptors: npt.NDArray[np.generic], dtype: str = "float32") -> bytes:
+    """Descriptors ``[n, d]`` as a blob, those of float as `dtype`: ``float32``, ``float16`` or ``uint8``.
+
+    Those of bits (uint8) stay as they are, and those of float that do not fit bytes (`semdb.byte_descriptors`).
+    """
+    if descriptors.dtype == np.int8:
+        return encode_array((descriptors.astype(np.int16) + ZERO).astype(np.uint8), magic=BYTES_MAGIC)
+    if descriptors.dtype == np.uint8:
+        return encode_array(descriptors)
+    if dtype != "uint8":
+        return encode_array(descriptors.astype(dtype) if descriptors.dtype == np.float32 else descriptors)
+    small = to_bytes(descriptors)
+    return encode_array(descriptors) if small is None else encode_descriptors(small)
+
+
+def dtype_of(head: bytes) -> str:
+    """``float32``, ``float16`` or ``uint8``, by the first `HEAD` bytes of descriptors; ``uint8`` of what is none."""
+    if len(head) < _HEADER.size or head[:4] != ARRAY_MAGIC:
+        return "uint8"
+    dtype = _DTYPES.get(_HEADER.unpack_from(head)[2])
+    return "uint8" if dtype is None else dtype.name
+
+
+def decode_descriptors(blob: bytes, where: str) -> npt.NDArray[np.generic]:
+    """Descriptors ``[n, d]`` of a blob: float32, float16, uint8 of bits, or int8 of `semdb.byte_descriptors`.
+
+    Raises CodecError for what is none of these.
+    """
+    small = blob[:4] == BYTES_MAGIC
+    found = decode_array(blob, where, magic=BYTES_MAGIC if small else ARRAY_MAGIC)
+    if found.ndim != 2 or found.dtype not in ((np.uint8,) if small else (np.float32, np.float16, np.uint8)):
+        raise CodecError(f"{where}: {found.dtype} {list(found.shape)} are no descriptors")
+    if not small:
+        return found
+    values: npt.NDArray[np.int8] = (found.astype(np.int16) - ZERO).astype(np.int8)
+    if not are_bytes(values):
+        raise CodecError(f"{where}: a descriptor of bytes is longer than a unit vector")
+    return values
+
+
 def encode_keypoints(keypoints: Keypoints, *, small: bool = False) -> bytes:
     """Keypoints packed as float32 ``[n, 9]``: x, y, size, angle, response, laplacian, X, Y, Z (camera frame, m).
 
@@ -200,6 +245,11 @@ def encode_keypoints(keypoints: Keypoints, *, small: bool = False) -> bytes:
     packed[:, 4] = features.response
     packed[:, 5] = features.laplacian
     packed[:, 6:9] = keypoints.points
+    return encode_packed(packed, small=small)
+
+
+def encode_packed(packed: Float32Array, *, small: bool) -> bytes:
+    """Rows float32 ``[n, 9]`` of keypoints as a blob; `small` as in `encode_keypoints`."""
     numbers = compact(packed) if small else None
     return encode_array(packed) if numbers is None else encode_array(numbers, magic=COMPACT_MAGIC)
 
@@ -256,7 +306,7 @@ class Header:
 
 def peek(blob: bytes) -> Header | None:
     """The head of an array, a mask or compact keypoints, unchecked; None for what is none or does not fit its size."""
-    if len(blob) < _HEADER.size or blob[:4] not in (ARRAY_MAGIC, MASK_MAGIC, COMPACT_MAGIC):
+    if len(blob) < _HEADER.size or blob[:4] not in (ARRAY_MAGIC, MASK_MAGIC, COMPACT_MAGIC, BYTES_MAGIC):
         return None
     magic, version, code, ndim, _, _ = _HEADER.unpack_from(blob)
     dtype = _DTYPES.get(code)

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semdb.database import checked
-from semdb.database.codecs import decode_array, decode_keypoints, keypoint_rows
+from semdb.database.codecs import decode_descriptors, decode_keypoints, keypoint_rows
 from semdb.database.records import KeyframeHead, StoredKeyframe, StoredObject
 from semdb.database.tables import POSE_COLUMNS
 from semdb.errors import CodecError, UsageError
@@ -117,12 +117,12 @@ def _check_keypoints(packed: Float32Array, row: Any, camera: Camera, where: str)
 
 def _descriptors(row: Any, count: int, where: str) -> npt.NDArray[np.generic]:
     where = f"descriptors.data of {where}"
-    found = decode_array(checked.blob(row.data, where), where)
-    if found.ndim != 2 or found.shape[1] > WIDEST or found.dtype not in (np.float32, np.float16, np.uint8):
+    found = decode_descriptors(checked.blob(row.data, where), where)
+    if found.shape[1] > WIDEST:
         raise CodecError(f"{where}: {found.dtype} {list(found.shape)} are no descriptors")
     if len(found) != count:
         raise CodecError(f"{where}: {len(found)} descriptors for {count} keypoints")
-    if found.dtype != np.uint8 and not np.isfinite(found).all():
+    if found.dtype in (np.float32, np.float16) and not np.isfinite(found).all():
         raise CodecError(f"{where}: a descriptor is not finite")
     return found
 

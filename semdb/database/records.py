@@ -85,9 +85,17 @@ class PlannedRecording:
     failed: tuple[int, ...]
 
 
+@dataclass(frozen=True, slots=True)
+class RowOptions:
+    """How rows are stored: `descriptor_dtype` of a `KeyframeRecord`, and what `kept_images` keeps of image files."""
+
+    descriptor_dtype: str = "float32"
+    keep_images: str = "original"
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyframeRecord:
-    """One keyframe with all that is stored of it. `image_bytes` and `depth_bytes` are the files as recorded."""
+    """One keyframe with all that is stored of it. `image_bytes` and `depth_bytes` are the files as they are stored."""
 
     frame_index: int
     timestamp_ns: int | None
@@ -98,7 +106,7 @@ class KeyframeRecord:
     depth_scale: float | None
     depth_registration: str
     description: Description
-    descriptor_dtype: str = "float32"  # of descriptors of float: "float16" takes half the room
+    descriptor_dtype: str = "float32"  # of descriptors of float: or "float16", "uint8", "auto" (as the map has them)
 
 
 @dataclass(frozen=True, slots=True)

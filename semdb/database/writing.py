@@ -8,12 +8,20 @@ from functools import partial
 from typing import Any, NoReturn
 
 import numpy as np
-from sqlalchemy import Connection, Engine, Table, bindparam, insert, select, update
+from sqlalchemy import Connection, Engine, Table, bindparam, func, insert, select, update
 from sqlalchemy.exc import IntegrityError
 
 from semdb.class_score import strengths
 from semdb.database import retry, tables
-from semdb.database.codecs import encode_array, encode_keypoints, encode_mask, image_format
+from semdb.database.codecs import (
+    HEAD,
+    dtype_of,
+    encode_array,
+    encode_descriptors,
+    encode_keypoints,
+    encode_mask,
+    image_format,
+)
 from semdb.database.engine import check_packet
 from semdb.database.ids import SharedIds, new_id
 from semdb.database.items import Claim, held_by
@@ -50,6 +58,7 @@ class _Target:
     map_id: int
     map_name: str
     model_ids: Mapping[ModelInfo, int]
+    descriptor_dtype: str  # of its last keyframe, "uint8" where it has none
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +133,7 @@ class KeyframeWriter:
             if row.state == RecordingState.PLANNED:
                 change = update(tables.recordings).where(tables.recordings.c.id == recording_id)
                 connection.execute(change.values(state=RecordingState.INGESTING.value))
-            return _Target(row.id, row.name, map_model_ids(connection, row.id))
+            return _Target(row.id, row.name, map_model_ids(connection, row.id), _dtype_of(connection, row.id))
 
         target = retry.write(self._engine, work)
         self._targets[recording_id] = target
@@ -146,7 +155,8 @@ class KeyframeWriter:
             **pose_columns(record.world_from_camera),
         }
         points = description.keypoints.points
-        features = {"model_id": by_role["features"]}
+        dtype = target.descriptor_dtype if record.descriptor_dtype == "auto" else record.descriptor_dtype
+        features, described = {"model_id": by_role["features"]}, description.keypoints.features.descriptors
         return _Rows(
             keyframe=keyframe,
             image=_image_row(record),
@@ -164,9 +174,9 @@ class KeyframeWriter:
                 **features,
                 "count": len(description.keypoints),
                 "count_3d": int(np.isfinite(points).all(axis=1).sum()),
-                "data": encode_keypoints(description.keypoints, small=record.descriptor_dtype == "float16"),
+                "data": encode_keypoints(description.keypoints, small=dtype != "float32"),
             },
-            descriptors={**features, "data": encode_array(_packed(description, record.descriptor_dtype))},
+            descriptors={**features, "data": encode_descriptors(described, dtype)},
         )
 
 
@@ -193,10 +203,13 @@ def _check_description(description: Description) -> None:
         raise UsageError("the CNN vector of a description is one finite row")
 
 
-def _packed(description: Description, dtype: str) -> np.ndarray[Any, Any]:
-    """Descriptors as they are stored. Those of bytes stay as they are."""
-    descriptors = description.keypoints.features.descriptors
-    return descriptors.astype(dtype) if descriptors.dtype == np.float32 else descriptors
+def _dtype_of(connection: Connection, map_id: int) -> str:
+    """How descriptors of float are stored in a map: as in its last keyframe, as bytes in a new map."""
+    k, r, d = tables.keyframes.c, tables.recordings.c, tables.descriptors.c
+    query = select(func.substr(d.data, 1, HEAD)).join(tables.keyframes, k.id == d.keyframe_id)
+    query = query.join(tables.recordings, r.id == k.recording_id).where(r.map_id == map_id)
+    head = connection.execute(query.order_by(k.id.desc()).limit(1)).scalar()
+    return "uint8" if head is None else dtype_of(bytes(head))
 
 
 def _image_row(record: KeyframeRecord) -> dict[str, Any]:

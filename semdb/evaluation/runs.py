@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
+from semdb.database.records import RowOptions
 from semdb.database.store import Store
 from semdb.errors import FrameError, RecordingError
 from semdb.evaluation.baselines import SiftReference, nearest_in_pose
@@ -287,7 +288,8 @@ def open_run(
     describer = describers.of(method)
     map_name = describer.features.info.name  # one map per kind of features: rows of two kinds do not mix
     if all(info.name != map_name for info in store.maps()):
-        _fill(map_name, task, describer, store, progress)
+        rows = RowOptions(describers.settings.descriptor_dtype, describers.settings.keep_images)
+        _fill(IngestOptions(map_name=map_name, rows=rows), task, describer, store, progress)
         if refine:
             kinds = (*FOR_LOCALIZATION, LANDMARKS)
             refine_map(store, store.find_map(map_name), kinds=kinds, progress=progress)
@@ -300,10 +302,9 @@ def open_run(
     return run(method, describer, localizer, query_depth or method.query_depth, store)
 
 
-def _fill(map_name: str, task: Task, describer: Describer, store: Store, progress: Progress | None) -> None:
+def _fill(options: IngestOptions, task: Task, describer: Describer, store: Store, progress: Progress | None) -> None:
     """Keyframes into the map."""
     for part in task.keyframes:
-        options = IngestOptions(map_name=map_name)
         summary = ingest_recording(
             part.recording, store, describer, options, progress=progress, entries=list(part.entries)
         )

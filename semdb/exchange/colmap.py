@@ -15,7 +15,7 @@ from semdb.errors import CodecError
 from semdb.exchange.source import ExportOptions, MapSource, decoded, new_folder, suffix_of
 from semdb.exchange.tracks import Tracks, View, find_tracks
 from semdb.geometry import invert_pose, quat_wxyz_from_rotation, transform_points
-from semdb.types import Camera, Int64Array
+from semdb.types import Camera, Float32Array, Int64Array
 
 HALF = 0.5
 METRIC = "# 1 unit is 1 metre"
@@ -95,7 +95,7 @@ def load_view(source: MapSource, index: int) -> View:
     if refined is not None and len(refined) == len(points):
         better = np.isfinite(refined[:, :3]).all(axis=1)
         points[better] = refined[better, :3]
-    described = np.asarray(features.descriptors, dtype=np.float32)
+    described: Float32Array = np.asarray(features.descriptors, dtype=np.float32)  # of unit length below, bytes as well
     norm = np.linalg.norm(described, axis=1, keepdims=True)
     described = described / np.maximum(norm, 1e-12)
     world = transform_points(head.world_from_camera, points)

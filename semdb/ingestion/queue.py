@@ -16,6 +16,7 @@ from semdb.database.items import OpenItem, open_items
 from semdb.database.planning import StoredPlan, check_models, stored_plan
 from semdb.database.pose_records import PoseSource
 from semdb.database.pose_sources import load_planned_poses, recording_poses
+from semdb.database.records import RowOptions
 from semdb.database.requeue import requeue_failed
 from semdb.database.store import Store, open_store
 from semdb.errors import ModelError, NotFoundError, RecordingError, RecordingUnavailableError, UsageError
@@ -211,7 +212,7 @@ class Workplace:
                     describers,
                     frames=part,
                     stop=stop,
-                    descriptor_dtype=self._settings.descriptor_dtype,
+                    rows=RowOptions(self._settings.descriptor_dtype, self._settings.keep_images),
                 ):
                     progress = True
                     outcome.stored += item.created

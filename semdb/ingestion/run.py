@@ -17,7 +17,7 @@ from semdb.database import items
 from semdb.database.findings import write_findings
 from semdb.database.ids import check_name
 from semdb.database.planning import check_models
-from semdb.database.records import PlannedRecording, RecordingFinding, RecordingPlan
+from semdb.database.records import PlannedRecording, RecordingFinding, RecordingPlan, RowOptions
 from semdb.database.requeue import requeue_failed
 from semdb.database.store import Store, open_store
 from semdb.errors import UsageError
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 Progress = Callable[[str, int, int], None]  # what, done, total
 Describers = dict[object, list[Describer]]  # by all that makes them what they are
 MOST_DESCRIBERS = 4  # each holds networks of its own
+AS_RECORDED = RowOptions()
 SECONDS_BETWEEN_LOOKS = 0.5  # at what other workers still have
 
 
@@ -51,7 +52,7 @@ class IngestOptions:
 
     `map_name` None gives each recording the map of `default_map_name`. `camera` is the text of ``--camera``,
     `reading` says of the files what they do not say, `check` whether that is compared with the images first;
-    `descriptor_dtype` is how descriptors of float are stored. `poses` are ``recorded``, ``estimated``, or ``auto``:
+    `rows` is how rows are stored. `poses` are ``recorded``, ``estimated``, or ``auto``:
     recorded where there are some. `like` names a map whose models describe a map that has none yet.
     """
 
@@ -62,7 +63,7 @@ class IngestOptions:
     camera: str | None = None
     reading: ReadOptions = AS_THE_FORMAT_SAYS
     check: bool = True
-    descriptor_dtype: str = "float32"
+    rows: RowOptions = AS_RECORDED
     poses: str = AUTO
     like: str | None = None
 
@@ -137,7 +138,7 @@ def ingest_opened(
 
     `describers` keeps networks for the next call, which must not be made meanwhile.
     """
-    options = replace(options, descriptor_dtype=settings.descriptor_dtype)
+    options = replace(options, rows=RowOptions(settings.descriptor_dtype, settings.keep_images))
     describers = {} if describers is None else describers
     summaries: list[IngestSummary] = []
     for recording in recordings:
@@ -262,9 +263,7 @@ def ingest_recording(
     requeue_failed(store.engine, summary.recording_id)
     done = 0
     while True:
-        for item in work_off(
-            recording, summary.recording_id, store, describers, descriptor_dtype=options.descriptor_dtype
-        ):
+        for item in work_off(recording, summary.recording_id, store, describers, rows=options.rows):
             _count(summary, item)
             log_item(summary.recording_id, item)
             done += 1

@@ -22,7 +22,7 @@ import numpy as np
 
 from semdb.database import items
 from semdb.database.items import Claim
-from semdb.database.records import KeyframeRecord
+from semdb.database.records import KeyframeRecord, RowOptions
 from semdb.database.store import Store
 from semdb.errors import (
     DatabaseError,
@@ -38,6 +38,7 @@ from semdb.events import event
 from semdb.ingestion.pipeline import Stage, overlapped
 from semdb.perception.describe import Describer, View
 from semdb.recordings.base import FrameEntry, Recording, remarks_on
+from semdb.recordings.kept_images import kept_images
 from semdb.types import Description, Frame, InstanceMasks
 
 STAGES = ("read", "detect", "encode", "features", "store")
@@ -81,7 +82,7 @@ def work_off(
     frames: Sequence[int] | None = None,
     stop: Callable[[], bool] = lambda: False,
     lease_s: int = items.LEASE_S,
-    descriptor_dtype: str = "float32",
+    rows: RowOptions | None = None,
 ) -> Iterator[Item]:
     """Claims keyframes of `recording`, of `frames` where given, and stores them; yields each when it is done.
 
@@ -100,7 +101,7 @@ def work_off(
     stages = (
         Stage("read", lambda group: [_read(recording, item) for item in group]),
         Stage("describe", lambda group: _describe(idle, group), len(describers)),
-        Stage("store", lambda group: [_store(store, recording_id, item, descriptor_dtype) for item in group]),
+        Stage("store", lambda group: [_store(store, recording_id, item, rows or RowOptions()) for item in group]),
     )
     claimed = _claims(recording, recording_id, store, worker, (batches, batch), frames, stop, lease_s)
     with _Renewal(store, recording_id, worker, lease_s), side_by_side():
@@ -297,24 +298,25 @@ def _take(item: Item, description: Description) -> None:
         item.seconds[stage] = milliseconds / 1000
 
 
-def _store(store: Store, recording_id: int, item: Item, descriptor_dtype: str = "float32") -> Item:
+def _store(store: Store, recording_id: int, item: Item, rows: RowOptions) -> Item:
     started = time.perf_counter()
     frame, description = item.frame, item.description
     item.frame = item.description = None  # so that what waits to be taken note of holds no images
     if frame is None or description is None or frame.world_from_camera is None:
         item.lost = not items.fail(store.engine, recording_id, item.claim, item.error or "")
         return item
+    image, depth = kept_images(frame.image_bytes, frame.depth_bytes, rows.keep_images, frame.name)
     record = KeyframeRecord(
         frame_index=frame.index,
         timestamp_ns=frame.timestamp_ns,
         camera=frame.camera,
         world_from_camera=frame.world_from_camera,
-        image_bytes=frame.image_bytes,
-        depth_bytes=frame.depth_bytes,
-        depth_scale=frame.depth_scale,
-        depth_registration=frame.depth_registration,
+        image_bytes=image,
+        depth_bytes=depth,
+        depth_scale=None if depth is None else frame.depth_scale,
+        depth_registration="" if depth is None else frame.depth_registration,
         description=description,
-        descriptor_dtype=descriptor_dtype,
+        descriptor_dtype=rows.descriptor_dtype,
     )
     try:
         item.created = store.write_keyframe(recording_id, record, item.claim).created

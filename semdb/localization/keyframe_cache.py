@@ -144,7 +144,10 @@ class KeyframeCache:
 
     def _is_comparable(self, keyframe: KeyframeView, descriptors: npt.NDArray[np.generic] | None) -> bool:
         own = keyframe.view.descriptors
-        if descriptors is None or (own.dtype == descriptors.dtype and own.shape[1] == descriptors.shape[1]):
+        if descriptors is None:
+            return True
+        alike = own.dtype == descriptors.dtype or {own.dtype.name, descriptors.dtype.name} == {"float32", "int8"}
+        if alike and own.shape[1] == descriptors.shape[1]:
             return True
         where = f"descriptors.data of keyframe {keyframe.keyframe_id}"
         theirs = f"{descriptors.dtype} with {descriptors.shape[1]}"

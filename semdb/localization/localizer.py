@@ -47,7 +47,7 @@ from semdb.localization.surface_search import search_surfaces
 from semdb.localization.surface_step import SurfaceVerdictOptions, weigh_surfaces
 from semdb.localization.surfaces import Surfaces, surfaces_of
 from semdb.localization.verdict import Judgement, VerdictOptions, convinces, judge
-from semdb.localization.views import View, make_view
+from semdb.localization.views import View, in_kind_of, make_view
 from semdb.types import (
     Candidate,
     ConsistentPose,
@@ -185,6 +185,7 @@ class Localizer:
         started = time.perf_counter()
         keyframes = self.cache.views(keyframe_ids, search.query.descriptors)
         search.keyframes += keyframes
+        search.query = in_kind_of(keyframes, search.query)
         search.matches += match_views(search.query, keyframes, self.options.pose)
         search.timing_ms["match"] += _ms_since(started)
 

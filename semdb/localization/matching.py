@@ -11,14 +11,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from semdb.byte_descriptors import SCALE, from_bytes, to_bytes
 from semdb.types import BoolArray, Float32Array, FloatArray, IntArray
 
 BACKGROUND = -1
 NOTHING = -1e30  # what is less close is not there
+NO_PRODUCT = -32768  # the same of products of bytes
 
 
 class Evidence(StrEnum):
@@ -63,8 +66,36 @@ def no_matches() -> Matches:
     return Matches(empty, empty, np.zeros(0, np.float32), np.zeros(0, np.bool_))
 
 
-def closeness(first: npt.NDArray[np.generic], second: npt.NDArray[np.generic]) -> Float32Array:
-    """How alike descriptors are ``[n, m]``: cosine of float32 unit vectors, or minus the bits in which uint8 differ."""
+def of_one_kind(
+    first: npt.NDArray[np.generic], second: npt.NDArray[np.generic]
+) -> tuple[npt.NDArray[np.generic], npt.NDArray[np.generic]]:
+    """Both as they are; of one of bytes (int8) and one of float both as bytes, or as float where these do not fit.
+
+    Rows of one map may be of either kind.
+    """
+    if (first.dtype == np.int8) == (second.dtype == np.int8) or np.uint8 in (first.dtype, second.dtype):
+        return first, second
+    if first.dtype == np.int8:
+        second, first = of_one_kind(second, first)
+        return first, second
+    small = to_bytes(first)
+    if small is not None:
+        return small, second
+    return first, from_bytes(np.asarray(second, np.int8))
+
+
+def closeness(first: npt.NDArray[np.generic], second: npt.NDArray[np.generic]) -> npt.NDArray[Any]:
+    """How alike descriptors are ``[n, m]``.
+
+    Cosine of float32 unit vectors; the product of int8 (`semdb.byte_descriptors`), int16; minus the bits in which
+    uint8 differ.
+    """
+    if first.dtype == np.int8:
+        from semdb.localization.matching_kernels import multiply_bytes
+
+        product = np.empty((len(first), len(second)), np.int16)
+        multiply_bytes(np.ascontiguousarray(first, np.int16), np.ascontiguousarray(second.T, np.int16), product)
+        return product
     if first.dtype == np.uint8:
         a = np.unpackbits(np.asarray(first, np.uint8), axis=1).astype(np.float32)
         b = np.unpackbits(np.asarray(second, np.uint8), axis=1).astype(np.float32)
@@ -76,10 +107,18 @@ def closeness(first: npt.NDArray[np.generic], second: npt.NDArray[np.generic]) -
     return close
 
 
-def distance_of(close: Float32Array, dtype: np.dtype[np.generic]) -> Float32Array:
+def distance_of(close: npt.NDArray[Any], dtype: np.dtype[np.generic]) -> Float32Array:
     """The distance that goes with `closeness`: squared Euclidean of unit vectors, Hamming of bits; inf for none."""
+    if dtype == np.int8:
+        return np.asarray(np.where(close == NO_PRODUCT, np.inf, _distance_of_products(close)), np.float32)
     distance = -close if dtype == np.uint8 else np.maximum(2 - 2 * close, 0)
     return np.asarray(np.where(close < NOTHING, np.inf, distance), np.float32)
+
+
+def _distance_of_products(product: npt.NDArray[Any]) -> Float32Array:
+    """Squared Euclidean distances of what `semdb.byte_descriptors` made bytes of, by their products."""
+    squared = np.float32(2) - product.astype(np.float32) * np.float32(2 / SCALE**2)
+    return np.asarray(np.maximum(squared, 0), np.float32)
 
 
 def _ratio_power(dtype: np.dtype[np.generic]) -> int:
@@ -101,21 +140,24 @@ class _Mutual:
 
 
 def _mutual(
-    close: Float32Array, dtype: np.dtype[np.generic], rows: IntArray | None = None, columns: IntArray | None = None
+    close: npt.NDArray[Any], dtype: np.dtype[np.generic], rows: IntArray | None = None, columns: IntArray | None = None
 ) -> _Mutual:
     """Mutual nearest neighbours between `rows` and `columns` (or all) of the `closeness` ``[n, m]`` of `dtype`."""
-    from semdb.localization.matching_kernels import scan, scan_all
+    from semdb.localization import matching_kernels as kernels
 
     everything = rows is None or columns is None
     if rows is None or columns is None:
         rows, columns = (np.arange(size, dtype=np.int32) for size in close.shape)
     n, m = len(rows), len(columns)
-    nearest, best, second = np.empty(n, np.int32), np.empty(n, np.float32), np.empty(n, np.float32)
-    best_back = np.empty(m, np.float32)
+    nearest, best, second = np.empty(n, np.int32), np.empty(n, close.dtype), np.empty(n, close.dtype)
+    best_back = np.empty(m, close.dtype)
+    whole, part = (
+        (kernels.scan_bytes, kernels.scan_some_bytes) if dtype == np.int8 else (kernels.scan_all, kernels.scan)
+    )
     if everything:
-        scan_all(close, nearest, best, second, best_back)
+        whole(close, nearest, best, second, best_back)
     else:
-        scan(close, rows, columns, nearest, best, second, best_back)
+        part(close, rows, columns, nearest, best, second, best_back)
     keep = best >= best_back[nearest]
     return _Mutual(rows[keep], columns[nearest[keep]], distance_of(best[keep], dtype), distance_of(second[keep], dtype))
 
@@ -138,6 +180,7 @@ def match_keypoints(
     also half the work.
     """
     options = options or MatchingOptions()
+    query_descriptors, keyframe_descriptors = of_one_kind(query_descriptors, keyframe_descriptors)
     if query_signs is None or keyframe_signs is None:
         query_signs, keyframe_signs = (
             np.zeros(len(query_descriptors), np.int8),
@@ -224,6 +267,7 @@ def match_guided(
     visible = np.flatnonzero(np.isfinite(projected_xy).all(axis=1))
     if len(query_descriptors) == 0 or len(visible) == 0:
         return no_matches()
+    query_descriptors, keyframe_descriptors = of_one_kind(query_descriptors, keyframe_descriptors)
     if query_signs is None or keyframe_signs is None:
         query_signs, keyframe_signs = np.zeros(len(query_xy), np.int8), np.zeros(len(projected_xy), np.int8)
     i, j = _pairs_within(
@@ -275,8 +319,12 @@ def _paired_distances(
     if first.dtype == np.uint8:
         differing = np.bitwise_count(np.asarray(first[i], np.uint8) ^ np.asarray(second[j], np.uint8))
         return np.asarray(differing.sum(axis=1), np.float32)
-    from semdb.localization.matching_kernels import dot_pairs
+    from semdb.localization.matching_kernels import dot_byte_pairs, dot_pairs
 
+    if first.dtype == np.int8:
+        products = np.empty(len(i), np.int32)
+        dot_byte_pairs(np.asarray(first, np.int8), np.asarray(second, np.int8), i, j, products)
+        return _distance_of_products(products)
     product = np.empty(len(i), np.float32)
     dot_pairs(np.asarray(first, np.float32), np.asarray(second, np.float32), i, j, product)
     return np.asarray(np.maximum(2 - 2 * product, 0), np.float32)

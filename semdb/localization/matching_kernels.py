@@ -159,3 +159,105 @@ def dot_pairs(first: Any, second: Any, i: Any, j: Any, out: Any) -> None:
         for d in range(first.shape[1]):
             total += first[one, d] * second[two, d]
         out[k] = total
+
+
+@kernel
+def multiply_bytes(first: Any, second: Any, out: Any) -> None:
+    """``first @ second`` of int16 matrices ``[n, d]`` and ``[d, m]`` in 16 bits: the products of bytes must fit them.
+
+    What overflows on the way does no harm, for it is counted modulo 2^16.
+    """
+    n, depth = first.shape
+    for i in range(0, n - 3, 4):
+        out0, out1, out2, out3 = out[i], out[i + 1], out[i + 2], out[i + 3]
+        out0[:], out1[:], out2[:], out3[:] = 0, 0, 0, 0
+        for k in range(0, depth - 3, 4):
+            row0, row1, row2, row3 = second[k], second[k + 1], second[k + 2], second[k + 3]
+            a0, a1, a2, a3 = first[i, k], first[i, k + 1], first[i, k + 2], first[i, k + 3]
+            b0, b1, b2, b3 = first[i + 1, k], first[i + 1, k + 1], first[i + 1, k + 2], first[i + 1, k + 3]
+            c0, c1, c2, c3 = first[i + 2, k], first[i + 2, k + 1], first[i + 2, k + 2], first[i + 2, k + 3]
+            d0, d1, d2, d3 = first[i + 3, k], first[i + 3, k + 1], first[i + 3, k + 2], first[i + 3, k + 3]
+            for j in range(out.shape[1]):
+                x, y, z, w = row0[j], row1[j], row2[j], row3[j]
+                out0[j] += np.int16(a0 * x + a1 * y + a2 * z + a3 * w)
+                out1[j] += np.int16(b0 * x + b1 * y + b2 * z + b3 * w)
+                out2[j] += np.int16(c0 * x + c1 * y + c2 * z + c3 * w)
+                out3[j] += np.int16(d0 * x + d1 * y + d2 * z + d3 * w)
+        for k in range(depth - depth % 4, depth):
+            _add_byte_rows(first, second, i, i + 4, k, out)
+    for i in range(n - n % 4, n):
+        out[i] = 0
+        for k in range(depth):
+            _add_byte_rows(first, second, i, i + 1, k, out)
+
+
+@kernel
+def _add_byte_rows(first: Any, second: Any, start: int, stop: int, k: int, out: Any) -> None:
+    for i in range(start, stop):
+        for j in range(out.shape[1]):
+            out[i, j] += np.int16(first[i, k] * second[k, j])
+
+
+@kernel
+def scan_bytes(closeness: Any, nearest: Any, best: Any, second: Any, best_back: Any) -> None:
+    """`scan_all` of int16 products; without a second it is -32768."""
+    best_back[:] = -32768
+    for i in range(closeness.shape[0]):
+        line = closeness[i]
+        greatest = _greatest(line, best_back)
+        at = 0
+        while at + 1 < len(line) and line[at] < greatest:
+            at += 1
+        nearest[i], best[i], second[i] = at, greatest, _following(line, greatest)
+
+
+@kernel
+def _greatest(line: Any, best_back: Any) -> Any:
+    greatest = np.int16(-32768)
+    for j in range(len(line)):
+        value = line[j]
+        greatest = max(greatest, value)
+        best_back[j] = max(best_back[j], value)
+    return greatest
+
+
+@kernel
+def _following(line: Any, greatest: Any) -> Any:
+    """The second greatest; loops without branches, so that each is vectorised."""
+    least = np.int16(-32768)
+    following, equal = least, np.int16(0)
+    for j in range(len(line)):
+        value = line[j]
+        following = max(following, value if value < greatest else least)
+    for j in range(len(line)):
+        equal += np.int16(line[j] == greatest)
+    return following if equal == 1 else greatest
+
+
+@kernel
+def scan_some_bytes(closeness: Any, rows: Any, columns: Any, nearest: Any, best: Any, second: Any, back: Any) -> None:
+    """`scan` of int16 products; without a second it is -32768."""
+    least = np.int16(-32768)
+    back[:] = least
+    for i in range(len(rows)):
+        first, following, at = least, least, 0
+        for j in range(len(columns)):
+            value = closeness[rows[i], columns[j]]
+            back[j] = max(back[j], value)
+            if value > following:
+                if value > first:
+                    following, first, at = first, value, j
+                else:
+                    following = value
+        nearest[i], best[i], second[i] = at, first, following
+
+
+@kernel
+def dot_byte_pairs(first: Any, second: Any, i: Any, j: Any, out: Any) -> None:
+    """`dot_pairs` of int8, as int32."""
+    for k in range(len(i)):
+        one, two = first[i[k]], second[j[k]]
+        total = np.int32(0)
+        for d in range(len(one)):
+            total += np.int32(one[d]) * np.int32(two[d])
+        out[k] = total

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
+from semdb.byte_descriptors import to_bytes
 from semdb.geometry import invert_pose, pixels_to_normalized, transform_points
 from semdb.localization.matching import BACKGROUND
 from semdb.types import Camera, Float32Array, FloatArray, ImageArray, IntArray, Keypoints
@@ -26,7 +27,7 @@ class View:
     seen_xy: Float32Array  # [n, 2] pixels, as seen
     xy: FloatArray  # [n, 2]
     size: Float32Array  # [n] pixels
-    descriptors: npt.NDArray[np.generic]  # [n, d]
+    descriptors: npt.NDArray[np.generic]  # [n, d] float32, int8 (byte_descriptors), or uint8 of bits
     classes: IntArray  # [n], -1 in the background
     signs: npt.NDArray[np.int8]  # [n] of the Laplacian, 0 where the feature has none
     points: Float32Array  # [n, 3] camera frame, NaN where there is no depth
@@ -57,6 +58,14 @@ class KeyframeView:
     camera_from_world: FloatArray
     world_points: FloatArray  # [n, 3]
     pose_sigma: tuple[float, float] | None = None  # how sure the pose is, along an axis: metres, radians
+
+
+def in_kind_of(keyframes: Sequence[KeyframeView], query: View) -> View:
+    """`query` with descriptors of bytes where those of a keyframe are, so that it is rounded once and not for each."""
+    if query.descriptors.dtype != np.float32 or all(one.view.descriptors.dtype != np.int8 for one in keyframes):
+        return query
+    small = to_bytes(query.descriptors)
+    return query if small is None else replace(query, descriptors=small)
 
 
 class ClassNumbers:

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from sqlalchemy import Connection
 
 from semdb.database import point_rows, refinements
@@ -48,7 +49,7 @@ class PointStep:
                 xy, described = known.keypoints.features.xy, known.keypoints.features.descriptors
                 volumes[known.id] = volume_of(known.camera, known.world_from_camera, xy, known.keypoints.points)
                 measured = measured or bool(np.isfinite(known.keypoints.points).any())
-                counts[known.id], kinds[known.id] = len(xy), (str(described.dtype), described.shape[1])
+                counts[known.id], kinds[known.id] = len(xy), (_kind(described), described.shape[1])
             progress(min(start + READ_CHUNK, len(listed)), 2 * len(listed))
         ids = _comparable(listed, kinds, store)
         options = self.options if measured else self.options.without_depth(len(ids))
@@ -70,6 +71,11 @@ class PointStep:
 
     def write(self, connection: Connection, map_id: int, result: Sequence[KeyframePoints]) -> int:
         return point_rows.replace_points(connection, map_id, result)
+
+
+def _kind(descriptors: npt.NDArray[np.generic]) -> str:
+    """Those of bytes are of float, rounded."""
+    return "float32" if descriptors.dtype == np.int8 else str(descriptors.dtype)
 
 
 def _comparable(listed: Sequence[int], kinds: Mapping[int, tuple[str, int]], store: Store) -> list[int]:

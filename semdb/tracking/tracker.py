@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from semdb.geometry import invert_pose, pose_error, pose_from, so3_exp, so3_log, transform_points
 from semdb.localization.confidence import sigmas
-from semdb.localization.views import KeyframeView, View
+from semdb.localization.views import KeyframeView, View, in_kind_of
 from semdb.tracking.options import MotionOptions, TrackerOptions
 from semdb.tracking.placing import Placed, convinces, place_anywhere_near, place_near, search_radius_px, step_between
 from semdb.tracking.pose_filter import FilterState, Step, begin, measured, moved, surprise, transition_of
@@ -121,7 +121,7 @@ class Tracker:
         keyframes = self.keyframes.views(ids, view.descriptors)
         if not keyframes:
             return None
-        distance = _distance_of(keyframes[0], pose)
+        view, distance = in_kind_of(keyframes, view), _distance_of(keyframes[0], pose)
         radius = search_radius_px(view, self._state.pose_covariance, distance, placing)
         return place_near(view, keyframes, pose, radius, placing) or place_anywhere_near(view, keyframes, placing)
 

@@ -1,4 +1,4 @@
-"""SEMDB_DESCRIPTOR_DTYPE=float16: half the room, read like all others, beside them in one map."""
+"""SEMDB_DESCRIPTOR_DTYPE: rows of half and of a quarter of the room, read like all others, beside them in one map."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 from sqlalchemy import func, select
 
+import semdb
+from semdb.byte_descriptors import from_bytes
 from semdb.database import tables
 from semdb.database.store import Store, open_store
 from semdb.ingestion.run import IngestOptions, ingest_recordings
@@ -45,6 +47,47 @@ def test_small_rows_hold_the_same_in_half_the_room(room: Path, database_url: str
             assert after.dtype == np.float32
             assert np.abs(after.astype(np.float64) - before.astype(np.float64)).max() < 3e-4
             np.testing.assert_array_equal(found.keypoints.object_index, expected.keypoints.object_index)
+
+
+def test_rows_of_bytes_hold_the_same_on_every_server(room: Path, database_url: str, tmp_path: Path) -> None:
+    """A new map has them without a setting; a map of others keeps to its own."""
+    here = f"sqlite:///{tmp_path / 'here.sqlite3'}"
+    for url in (here, database_url):
+        ingest_recordings([room], settings(url, "auto"), IngestOptions(keyframes=3, map_name="m"))
+    whole = f"sqlite:///{tmp_path / 'whole.sqlite3'}"
+    ingest_recordings([room], settings(whole, "float32"), IngestOptions(keyframes=3, map_name="m"))
+    with open_store(whole) as large, open_store(here) as first, open_store(database_url) as second:
+        keypoints = sum(len(kept.keypoints) for kept in large.load_keyframes(large.keyframe_ids(1)))
+        for store in (first, second):
+            assert bytes_of(store, "descriptors") == 3 * 20 + 64 * keypoints
+            assert bytes_of(store, "keypoints") == 3 * 68 + 16 * keypoints
+        d = tables.descriptors.c
+        blobs = []
+        for store in (first, second):
+            with store.engine.connect() as connection:
+                blobs.append([bytes(row.data) for row in connection.execute(select(d.data).order_by(d.keyframe_id))])
+        assert blobs[0] == blobs[1]
+        found = second.load_keyframes(second.keyframe_ids(1))
+        for kept, exact in zip(found, large.load_keyframes(large.keyframe_ids(1)), strict=True):
+            assert kept.keypoints.features.descriptors.dtype == np.int8
+            back = from_bytes(kept.keypoints.features.descriptors)
+            assert np.abs(back - exact.keypoints.features.descriptors).max() <= 0.5 / 172 + 1e-6
+    ingest_recordings([room], settings(whole, "auto"), IngestOptions(keyframes=4, map_name="m", name="more"))
+    with open_store(whole) as store:
+        kinds = {k.keypoints.features.descriptors.dtype.name for k in store.load_keyframes(store.keyframe_ids(1))}
+        assert kinds == {"float32"}
+
+
+def test_a_map_of_both_kinds_answers_as_one(room: Path, tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'a.sqlite3'}"
+    for name, dtype in (("first", "float32"), ("second", "uint8")):
+        ingest_recordings([room], settings(url, dtype), IngestOptions(keyframes=3, map_name="m", name=name))
+    with semdb.open(url) as db:
+        names = set()
+        for found in db.localize_recording(room, every=10):
+            assert found.verdict == "localized"
+            names |= {one.recording for one in found.candidates if one.inliers}
+        assert names == {"first", "second"}
 
 
 def test_one_map_has_rows_of_both_kinds(room: Path, tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from semdb.byte_descriptors import from_bytes
 from semdb.compiled import kernel
 from semdb.geometry import invert_pose, transform_points
 from semdb.localization.adjustment import in_front
@@ -29,6 +30,8 @@ DEPTH_SHARE = 0.05  # how far a measured depth may be off, with what the poses a
 
 def comparable(descriptors: npt.NDArray[np.generic]) -> Float32Array:
     """Unit vectors ``[n, d]`` whose squared distances order as those of `descriptors`: packed bits become signs."""
+    if descriptors.dtype == np.int8:
+        return np.ascontiguousarray(from_bytes(np.asarray(descriptors, np.int8)))
     if descriptors.dtype != np.uint8:
         return np.ascontiguousarray(descriptors, np.float32)
     bits = np.unpackbits(np.asarray(descriptors, np.uint8), axis=1).astype(np.float32)
