@@ -86,7 +86,7 @@ def main() -> None:
 def measure(db: semdb.Database, path: Path, arguments: argparse.Namespace) -> list[dict[str, object]]:
     recording = open_recording(path)
     name = path.name
-    if name not in [known.name for known in db.maps()]:
+    if not Path(str(arguments.database)).exists() or name not in [known.name for known in db.maps()]:
         db.ingest(path, map=name, keyframes=arguments.keyframes)
         db.refine(name)
     stored = {keyframe.frame_index for keyframe in db.keyframes(name)}

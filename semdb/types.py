@@ -161,6 +161,17 @@ class ObjectGeometry:
     extent: FloatArray  # [3] metres, axis-aligned in the camera frame, 5th to 95th percentile
 
 
+@dataclass(frozen=True, slots=True)
+class ImageQuality:
+    """How good an image is (`semdb.perception.quality`)."""
+
+    sharpness: float  # mean squared gradient, grey values per pixel
+    exposure: float  # mean grey, 0 black to 1 white
+    contrast: float  # from the 5th to the 95th percentile of the grey values, 0 to 1
+    blur_px: float  # length of the motion that blurs it, 0 where there is none
+    blur_deg: float  # its direction, from x towards y, 0 to 180
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Description:
     """All that semdb knows of one image. Made by `semdb.perception.describe`, for keyframes and queries alike."""
@@ -176,6 +187,7 @@ class Description:
     depth: Float32Array | None = None  # [H, W] metres, NaN where there is none; not stored
     sightings: tuple[Sighting, ...] | None = None  # all that the detector saw; None: the detections
     dynamic: frozenset[str] = frozenset()  # categories of objects that move: they say nothing about a place
+    stretch: tuple[float, float] | None = None  # grey values that are 0 and 255 in `grey`, where contrast was stretched
 
     @property
     def category_counts(self) -> dict[str, int]:

@@ -9,7 +9,16 @@ from enum import StrEnum
 from typing import Any
 
 from semdb.database.pose_records import PlannedPoses
-from semdb.types import Camera, Description, Float32Array, FloatArray, Keypoints, ModelInfo, ObjectGeometry
+from semdb.types import (
+    Camera,
+    Description,
+    Float32Array,
+    FloatArray,
+    ImageQuality,
+    Keypoints,
+    ModelInfo,
+    ObjectGeometry,
+)
 
 
 class RecordingState(StrEnum):
@@ -107,6 +116,7 @@ class KeyframeRecord:
     depth_registration: str
     description: Description
     descriptor_dtype: str = "float32"  # of descriptors of float: or "float16", "uint8", "auto" (as the map has them)
+    quality: ImageQuality | None = None  # None: not known
 
 
 @dataclass(frozen=True, slots=True)

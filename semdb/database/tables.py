@@ -385,6 +385,12 @@ pose_covariances = _table(
     Column("data", Blob, nullable=False),
 )
 
+keyframe_qualities = _table(
+    "keyframe_qualities",
+    _ref("keyframe_id", "keyframes.id", primary_key=True),
+    *(Column(name, Double, nullable=False) for name in ("sharpness", "exposure", "contrast", "blur_px", "blur_deg")),
+)
+
 loop_closures = _table(
     "loop_closures",
     _ref("keyframe_id", "keyframes.id", primary_key=True),

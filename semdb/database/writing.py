@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any, NoReturn
 
@@ -73,6 +73,7 @@ class _Rows:
     categories: list[dict[str, Any]]
     keypoints: dict[str, Any]
     descriptors: dict[str, Any]
+    quality: dict[str, Any] | None
 
 
 class KeyframeWriter:
@@ -177,6 +178,7 @@ class KeyframeWriter:
                 "data": encode_keypoints(description.keypoints, small=dtype != "float32"),
             },
             descriptors={**features, "data": encode_descriptors(described, dtype)},
+            quality=None if record.quality is None else asdict(record.quality),
         )
 
 
@@ -326,6 +328,8 @@ def _write_children(connection: Connection, keyframe_id: int, rows: _Rows) -> No
     for table, row in singles:
         _check_size(connection, table, row, rows.keyframe["frame_index"])
         connection.execute(insert(table), {**key, **row})
+    if rows.quality is not None:
+        connection.execute(insert(tables.keyframe_qualities), {**key, **rows.quality})
     if rows.categories:
         connection.execute(insert(tables.keyframe_categories), [{**key, **row} for row in rows.categories])
     if not rows.objects:

@@ -37,6 +37,7 @@ from semdb.errors import (
 from semdb.events import event
 from semdb.ingestion.pipeline import Stage, overlapped
 from semdb.perception.describe import Describer, View
+from semdb.perception.quality import image_quality
 from semdb.recordings.base import FrameEntry, Recording, remarks_on
 from semdb.recordings.kept_images import kept_images
 from semdb.types import Description, Frame, InstanceMasks
@@ -317,6 +318,7 @@ def _store(store: Store, recording_id: int, item: Item, rows: RowOptions) -> Ite
         depth_registration="" if depth is None else frame.depth_registration,
         description=description,
         descriptor_dtype=rows.descriptor_dtype,
+        quality=None if description.grey is None else image_quality(description.grey, description.stretch),
     )
     try:
         item.created = store.write_keyframe(recording_id, record, item.claim).created

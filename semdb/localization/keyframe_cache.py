@@ -42,7 +42,7 @@ class KeyframeCache:
     def __init__(self, store: Store, map_id: int, capacity: int = 64, *, refined: bool = True) -> None:
         self.numbers = ClassNumbers()
         self._turn = threading.RLock()
-        self._store = store
+        self.store = store
         self._map_id = map_id
         self._capacity = capacity
         self._views: OrderedDict[int, KeyframeView] = OrderedDict()
@@ -61,7 +61,7 @@ class KeyframeCache:
         """What becomes of refined points: ``used``, ``stale`` (the map has changed since), ``none`` or ``off``."""
         with self._turn:
             if self._points is None:
-                known = [item for item in self._store.refinements(self._map_id) if item.kind == POINTS]
+                known = [item for item in self.store.refinements(self._map_id) if item.kind == POINTS]
                 self._points = NONE if not known else USED if known[0].current else STALE
             return self._points
 
@@ -113,14 +113,14 @@ class KeyframeCache:
     def _load(self, missing: Sequence[int]) -> None:
         if not missing:
             return
-        refined = self._store.refined_points(missing, self._store.left_out) if self.points == USED else {}
-        sure = load_covariances(self._store.engine, missing, self._store.left_out)
+        refined = self.store.refined_points(missing, self.store.left_out) if self.points == USED else {}
+        sure = load_covariances(self.store.engine, missing, self.store.left_out)
         for stored in self._stored(missing):
             self._names[stored.id] = (stored.recording, stored.frame_index)
             try:
                 keypoints, looser = with_refined(stored.keypoints, refined.get(stored.id), stored.id)
             except CodecError as error:
-                self._store.left_out(stored.id, error)
+                self.store.left_out(stored.id, error)
                 keypoints, looser = stored.keypoints, None
             self._views[stored.id] = make_keyframe_view(
                 stored.id,
@@ -136,7 +136,7 @@ class KeyframeCache:
 
     def _stored(self, keyframe_ids: Sequence[int]) -> list[StoredKeyframe]:
         try:
-            return self._store.load_keyframes(keyframe_ids, bad=self._leave_out) if keyframe_ids else []
+            return self.store.load_keyframes(keyframe_ids, bad=self._leave_out) if keyframe_ids else []
         except NotFoundError:
             if len(keyframe_ids) == 1:
                 return []  # deleted since the coarse step proposed it
@@ -157,20 +157,20 @@ class KeyframeCache:
 
     def _leave_out(self, keyframe_id: int, error: CodecError) -> None:
         self.left_out[keyframe_id] = error
-        self._store.left_out(keyframe_id, error)
+        self.store.left_out(keyframe_id, error)
 
     def _grey(self, stored: StoredKeyframe) -> ImageArray | None:
         """The keyframe's image in grey; None where it cannot be decoded or is not what the camera took."""
         where = f"keyframe_images.rgb of keyframe {stored.id}"
         try:
-            data = self._store.load_image(stored.id).rgb
+            data = self.store.load_image(stored.id).rgb
             if not has_size(data, (stored.camera.width, stored.camera.height)):
                 return None
             return decode_color_grey(data, where)
         except NotFoundError:  # deleted a moment ago
             return None
         except (FrameError, CodecError) as error:
-            self._store.left_out(stored.id, CodecError(str(error)))
+            self.store.left_out(stored.id, CodecError(str(error)))
             return None
 
     def name_of(self, keyframe_id: int) -> tuple[str, int]:
@@ -217,7 +217,7 @@ class KeyframeCache:
         with self._turn:
             if not self._landmarks_read:
                 try:
-                    self._landmarks = read_map_landmarks(self._store, self._map_id, self._read_poses()[1])
+                    self._landmarks = read_map_landmarks(self.store, self._map_id, self._read_poses()[1])
                 except CodecError:  # those who ask for landmarks are told; an image has its answer without
                     self._landmarks = None
                 self._landmarks_read = True
@@ -239,11 +239,11 @@ class KeyframeCache:
 
     def _read_poses(self) -> tuple[list[int], FloatArray]:
         if self._poses is None:
-            self._poses = self._store.poses(self._map_id, bad=self._store.left_out)
+            self._poses = self.store.poses(self._map_id, bad=self.store.left_out)
         elif self._stale:
             ids = np.array(self._poses[0], np.int64)
             kept = ~np.isin(ids, list(self._stale))
-            new_ids, new_poses = self._store.poses(self._map_id, sorted(self._stale), self._store.left_out)
+            new_ids, new_poses = self.store.poses(self._map_id, sorted(self._stale), self.store.left_out)
             ids = np.concatenate([ids[kept], np.array(new_ids, np.int64)])
             order = np.argsort(ids, kind="stable")
             self._poses = ids[order].tolist(), np.concatenate([self._poses[1][kept], new_poses])[order]

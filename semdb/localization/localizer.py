@@ -11,6 +11,7 @@ import numpy as np
 from semdb.class_score import strengths
 from semdb.database.planning import check_models
 from semdb.errors import NotFoundError
+from semdb.localization.blurred import BlurOptions, BlurredKeyframes, blurred_query, extractor_for
 from semdb.localization.coarse import (
     Batch,
     CoarseOptions,
@@ -48,6 +49,7 @@ from semdb.localization.surface_step import SurfaceVerdictOptions, weigh_surface
 from semdb.localization.surfaces import Surfaces, surfaces_of
 from semdb.localization.verdict import Judgement, VerdictOptions, convinces, judge
 from semdb.localization.views import View, in_kind_of, make_view
+from semdb.perception.quality import complaint_of, image_quality, motion_blur
 from semdb.types import (
     Candidate,
     ConsistentPose,
@@ -75,6 +77,7 @@ class LocalizerOptions:
     refined_points: bool = True  # those of `semdb refine`, where the map has not changed since
     surfaces: SurfaceVerdictOptions | None = field(default_factory=SurfaceVerdictOptions)  # of a query with depth
     edges: EdgeVerdictOptions | None = field(default_factory=EdgeVerdictOptions)  # where neither convinces
+    blur: BlurOptions | None = field(default_factory=BlurOptions)  # of a query that motion has blurred
     landmarks: LandmarkPoseOptions | None = field(default_factory=LandmarkPoseOptions)  # where keypoints fail
     accept: Tolerance | None = None  # how far poses may differ that are one, where a query does not say
     twin_cosine: float = 0.05  # how much less than the best keyframe's cosine is "as much"
@@ -128,6 +131,8 @@ class Localizer:
             if convinces(search.first, self.options.verdict):
                 break
             started = time.perf_counter()
+        else:
+            self._blur_alike(search, description)
         search.timing_ms["filter"] = source.filter_ms
         search.timing_ms["rank"] -= source.filter_ms
         return self._conclude(search, description)
@@ -172,6 +177,27 @@ class Localizer:
             description.camera, description.keypoints, categories, self.cache.numbers, grey=description.grey
         )
 
+    def _blur_alike(self, search: Search, description: Description) -> None:
+        """Where motion has blurred the query the likeliest keyframes are blurred alike, if more agrees then."""
+        options, threads = self.options.blur, self.options.pose.threads
+        if options is None or description.grey is None or not search.keyframes:
+            return
+        started = time.perf_counter()
+        extractor, blur = extractor_for(self.models, options, threads), motion_blur(description.grey)
+        if extractor is None or blur is None:
+            return
+        query = blurred_query(description, description.grey, extractor, self.cache.numbers)
+        order = sorted(range(len(search.keyframes)), key=lambda slot: (-len(search.matches[slot]), slot))
+        likeliest = [search.keyframes[slot] for slot in order[: options.keyframes]]
+        blurred = BlurredKeyframes(self.cache.store, extractor, blur, self.cache.numbers)
+        keyframes = blurred.views(likeliest, threads)
+        matches = match_views(query, keyframes, self.options.pose)
+        first = first_pose(query, keyframes, matches, self.options.pose)
+        if first is not None and (search.first is None or first.inliers > search.first.inliers):
+            search.query, search.keyframes, search.matches, search.first = query, keyframes, matches, first
+            search.blurred = blurred
+        search.timing_ms["match"] += _ms_since(started)
+
     def _try(self, search: Search, batch: Batch) -> None:
         search.stage, search.ranked = batch.stage, batch.ranked
         search.proposals += batch.proposals
@@ -183,7 +209,9 @@ class Localizer:
 
     def _match(self, search: Search, keyframe_ids: Sequence[int]) -> None:
         started = time.perf_counter()
-        keyframes = self.cache.views(keyframe_ids, search.query.descriptors)
+        keyframes = self.cache.views(keyframe_ids, None if search.blurred else search.query.descriptors)
+        if search.blurred is not None:
+            keyframes = search.blurred.views(keyframes, self.options.pose.threads)
         search.keyframes += keyframes
         search.query = in_kind_of(keyframes, search.query)
         search.matches += match_views(search.query, keyframes, self.options.pose)
@@ -218,6 +246,9 @@ class Localizer:
         search.timing_ms["pose"] += _ms_since(started)
         if judgement.verdict is Verdict.FAILED and search.stage != Stage.GIVEN:
             judgement = self._by_landmarks(search, description, judgement)
+        if judgement.verdict is not Verdict.LOCALIZED and description.grey is not None:
+            wrong = complaint_of(image_quality(description.grey, description.stretch))
+            judgement = replace(judgement, reason="; ".join(filter(None, (judgement.reason, wrong))))
         return self._result(search, judgement, evidence)
 
     def _by_landmarks(self, search: Search, description: Description, judgement: Judgement) -> Judgement:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from semdb.localization.blurred import BlurredKeyframes
 from semdb.localization.coarse import Proposal, Stage
 from semdb.localization.confidence import Evidence, gather_evidence
 from semdb.localization.laid_pose import LaidPose
@@ -28,6 +29,7 @@ class Search:
     matches: list[Matches] = field(default_factory=list)
     proposals: list[Proposal] = field(default_factory=list)
     first: FirstPose | None = None
+    blurred: BlurredKeyframes | None = None  # what makes its keyframes, where these are blurred like it
     estimate: PoseEstimate | None = None
     following: tuple[Proposal, ...] = ()
     stage: str = Stage.FILTERED

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import cv2
@@ -16,6 +16,7 @@ from semdb.perception.encoders import load_encoder
 from semdb.perception.lifting import lift
 from semdb.perception.objects import assign_to_objects, object_geometry, sort_by_object
 from semdb.perception.protocols import BatchDetector, BatchEncoder, Detector, Encoder, FeatureExtractor
+from semdb.perception.quality import stretch_of, stretched
 from semdb.settings import Settings
 from semdb.types import (
     Camera,
@@ -102,10 +103,15 @@ class Describer:
         """
         for view in views:
             _check_sizes(view.image, view.depth, view.camera)
+        stretches = [stretch_of(cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY)) for view in views]
+        views = [
+            view if stretch is None else replace(view, image=stretched(view.image, stretch))
+            for view, stretch in zip(views, stretches, strict=True)
+        ]
         found, detect_ms = _timed(lambda: self._detect(views))
         vectors, encode_ms = _timed(lambda: self._encode([view.image for view in views]))
         shares = {"detect": detect_ms / max(1, len(views)), "encode": encode_ms / max(1, len(views))}
-        return [self._finish(*each, shares) for each in zip(views, found, vectors, strict=True)]
+        return [self._finish(*each, shares) for each in zip(views, found, vectors, stretches, strict=True)]
 
     def _detect(self, views: Sequence[View]) -> list[tuple[Detection, ...]]:
         """What the detector finds, before the rules."""
@@ -119,7 +125,12 @@ class Describer:
         return [self.encoder.encode(image) for image in images]
 
     def _finish(
-        self, view: View, found: tuple[Detection, ...], vector: Float32Array, timing_ms: dict[str, float]
+        self,
+        view: View,
+        found: tuple[Detection, ...],
+        vector: Float32Array,
+        stretch: tuple[float, float] | None,
+        timing_ms: dict[str, float],
     ) -> Description:
         (regions, sightings), rules_ms = _timed(lambda: self._judge(found, view.image.shape[0]))
         detections = tuple(region.detection for region in regions)
@@ -144,6 +155,7 @@ class Describer:
             },
             grey=grey,
             depth=view.depth,
+            stretch=stretch,
         )
 
     def _judge(self, found: tuple[Detection, ...], height: int) -> tuple[tuple[Region, ...], tuple[Sighting, ...]]:

@@ -34,6 +34,7 @@ VIEWS = {
     "covisible_objects",
     "keypoint_counts",
     "keyframe_links",
+    "keyframe_quality",
     "landmark_list",
     "landmark_relations_named",
     "landmark_visit_list",
