@@ -34,6 +34,11 @@ def from_bytes(descriptors: Int8Array) -> Float32Array:
     return np.asarray(descriptors, np.float32) / np.float32(SCALE)
 
 
+def as_float(descriptors: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
+    """Descriptors of bytes as float; others as they are."""
+    return from_bytes(np.asarray(descriptors, np.int8)) if descriptors.dtype == np.int8 else descriptors
+
+
 def are_bytes(descriptors: Int8Array) -> bool:
     """Whether rows ``[n, d]`` are such as `to_bytes` gives: products of others would not fit 16 bits."""
     if descriptors.ndim != 2 or descriptors.shape[1] > WIDEST:

@@ -8,10 +8,9 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from sqlalchemy import Connection, Engine, Table, func, select, update
 
-from semdb.byte_descriptors import from_bytes
+from semdb.byte_descriptors import as_float
 from semdb.database import checked, retry, tables
 from semdb.database.codecs import (
     COMPACT_MAGIC,
@@ -24,7 +23,6 @@ from semdb.database.codecs import (
 from semdb.database.engine import check_packet
 from semdb.database.reading import Bad, keyframe_ids
 from semdb.errors import CodecError
-from semdb.types import Float32Array
 
 SMALLER = ("float16", "uint8")  # how descriptors of float can be made smaller
 _RANK = {"float32": 0, "float16": 1, "int8": 2, "uint8": 2}  # of numpy's names; what is of bits is as small already
@@ -122,7 +120,11 @@ def _rows(connection: Connection, key: int, dtype: str | None) -> tuple[int, int
     described = checked.blob(row.described, f"descriptors.data of {where}")
     values = decode_descriptors(described, f"descriptors.data of {where}")
     changes: _Change = []
-    small = described if _RANK[values.dtype.name] >= _RANK[dtype] else encode_descriptors(_float(values), dtype)
+    small = (
+        described
+        if _RANK[values.dtype.name] >= _RANK[dtype]
+        else encode_descriptors(np.asarray(as_float(values), np.float32), dtype)
+    )
     if len(small) < len(described):
         changes.append((tables.descriptors, {"data": small}))
     else:
@@ -135,12 +137,6 @@ def _rows(connection: Connection, key: int, dtype: str | None) -> tuple[int, int
         else:
             packed = keypoints
     return len(keypoints) + len(described), len(packed) + len(small), changes
-
-
-def _float(descriptors: npt.NDArray[np.generic]) -> Float32Array:
-    if descriptors.dtype == np.int8:
-        return from_bytes(np.asarray(descriptors, np.int8))
-    return np.asarray(descriptors, np.float32)
 
 
 def _images(connection: Connection, key: int, keep: Keep | None) -> tuple[int, int, _Change]:

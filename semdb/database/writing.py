@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any, NoReturn
@@ -134,7 +134,8 @@ class KeyframeWriter:
             if row.state == RecordingState.PLANNED:
                 change = update(tables.recordings).where(tables.recordings.c.id == recording_id)
                 connection.execute(change.values(state=RecordingState.INGESTING.value))
-            return _Target(row.id, row.name, map_model_ids(connection, row.id), _dtype_of(connection, row.id))
+            models = map_model_ids(connection, row.id)
+            return _Target(row.id, row.name, models, _dtype_of(connection, row.id, models))
 
         target = retry.write(self._engine, work)
         self._targets[recording_id] = target
@@ -205,13 +206,18 @@ def _check_description(description: Description) -> None:
         raise UsageError("the CNN vector of a description is one finite row")
 
 
-def _dtype_of(connection: Connection, map_id: int) -> str:
-    """How descriptors of float are stored in a map: as in its last keyframe, as bytes in a new map."""
+def _dtype_of(connection: Connection, map_id: int, models: Collection[ModelInfo]) -> str:
+    """How descriptors of float are stored in a map: as in its last keyframe, as bytes in a new map.
+
+    Those of networks stay whole: what bytes cost them is not known.
+    """
     k, r, d = tables.keyframes.c, tables.recordings.c, tables.descriptors.c
     query = select(func.substr(d.data, 1, HEAD)).join(tables.keyframes, k.id == d.keyframe_id)
     query = query.join(tables.recordings, r.id == k.recording_id).where(r.map_id == map_id)
     head = connection.execute(query.order_by(k.id.desc()).limit(1)).scalar()
-    return "uint8" if head is None else dtype_of(bytes(head))
+    if head is not None:
+        return dtype_of(bytes(head))
+    return "float32" if any(one.role == "features" and one.name.startswith("onnx:") for one in models) else "uint8"
 
 
 def _image_row(record: KeyframeRecord) -> dict[str, Any]:

@@ -33,15 +33,18 @@ class BlurOptions:
     hessian_threshold: float = 15.0  # of SURF, on both images: blurred ones have little contrast
 
 
-def extractor_for(models: Sequence[ModelInfo], options: BlurOptions, threads: int) -> FeatureExtractor | None:
-    """What describes blurred images of a map; None where its local feature is none that is known to gain."""
+def extractor_for(models: Sequence[ModelInfo], options: BlurOptions) -> FeatureExtractor | None:
+    """What describes blurred images of a map; None where its local feature is none that is known to gain.
+
+    On one thread: work that is spread over the pool of threads must not wait for others of the pool.
+    """
     info = next((info for info in models if info.role == "features"), None)
     if info is None or info.name != "surf":
         return None
     from semdb.perception.features.surf_features import SurfFeatures
 
     most = json.loads(info.config).get("max_keypoints", 1500)
-    return SurfFeatures(options.hessian_threshold, max_keypoints=int(most), threads=threads)
+    return SurfFeatures(options.hessian_threshold, max_keypoints=int(most))
 
 
 def blurred_query(

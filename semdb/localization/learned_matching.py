@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from semdb.byte_descriptors import as_float
 from semdb.localization.matching import BACKGROUND, Evidence, Matches, MatchingOptions
 from semdb.localization.views import View
 from semdb.types import Float32Array, IntArray, ModelInfo
@@ -52,10 +53,11 @@ def for_learned(options: MatchingOptions) -> MatchingOptions:
 def match_by(matcher: KeypointMatcher, query: View, keyframe: View, options: MatchingOptions) -> Matches:
     """What `matcher` pairs, sorted by the query's index."""
     sizes = [(view.camera.width, view.camera.height) for view in (query, keyframe)]
-    i, j = matcher.match(query.seen_xy, query.descriptors, sizes[0], keyframe.seen_xy, keyframe.descriptors, sizes[1])
+    first, second = (as_float(view.descriptors) for view in (query, keyframe))
+    i, j = matcher.match(query.seen_xy, first, sizes[0], keyframe.seen_xy, second, sizes[1])
     same = (query.classes[i] == keyframe.classes[j]) & (query.classes[i] != BACKGROUND)
     if options.evidence is Evidence.OBJECTS:
         i, j, same = i[same], j[same], same[same]
-    one, two = np.asarray(query.descriptors[i], np.float32), np.asarray(keyframe.descriptors[j], np.float32)
+    one, two = np.asarray(first[i], np.float32), np.asarray(second[j], np.float32)
     product = np.einsum("nd,nd->n", one, two)
     return Matches(i, j, np.asarray(np.maximum(2 - 2 * product, 0), np.float32), same)

@@ -16,6 +16,7 @@ from semdb.types import Float32Array, ImageArray, ImageQuality, IntArray
 
 DARK = 80.0  # grey values between the 5th and 95th percentile below which contrast is stretched; ordinary ones have 120
 BLOCK = 256  # pixels of a side of the pieces whose spectra are averaged
+SMALLEST = 160  # pixels of a side of an image in which motion is looked for
 SHORTEST, LONGEST = 6.0, 50.0  # pixels of motion that are looked for
 LEAST_PEAK = 0.3  # of depth times height over its surroundings; images of the recordings without blur reach 0.27
 
@@ -66,7 +67,7 @@ def sharpness_of(grey: ImageArray) -> float:
 
 def motion_blur(grey: ImageArray) -> tuple[float, float] | None:
     """Length (pixels) and direction (degrees from x towards y, 0 to 180) of motion blur; None where there is none."""
-    if min(grey.shape) < BLOCK:
+    if min(grey.shape) < SMALLEST:
         return None
     cepstrum = _cepstrum(grey.astype(np.float32))
     rings, radius = _rings()
@@ -113,19 +114,27 @@ def blurred_like(grey: ImageArray, blur: tuple[float, float]) -> ImageArray:
 
 def _cepstrum(grey: Float32Array) -> Float32Array:
     """Of the mean power of pieces of the image, ``[256, 256]`` with the middle at (128, 128)."""
-    taper = np.hanning(BLOCK).astype(np.float32)
-    window = np.outer(taper, taper)
     height, width = grey.shape
-    rows, columns = (np.linspace(0, size - BLOCK, 2 + (size > 2 * BLOCK)).astype(int) for size in (height, width))
+    high, wide = min(height, BLOCK), min(width, BLOCK)
+    window = np.outer(np.hanning(high), np.hanning(wide)).astype(np.float32)
+    rows, columns = (_starts(size) for size in (height, width))
     power = np.zeros((BLOCK, BLOCK), np.float32)
     for top in rows.tolist():
         for left in columns.tolist():
             piece = grey[top : top + BLOCK, left : left + BLOCK]
-            spectrum = cv2.dft((piece - piece.mean()) * window, flags=cv2.DFT_COMPLEX_OUTPUT)
+            padded = np.zeros((BLOCK, BLOCK), np.float32)
+            padded[:high, :wide] = (piece - piece.mean()) * window
+            spectrum = cv2.dft(padded, flags=cv2.DFT_COMPLEX_OUTPUT)
             power += (spectrum**2).sum(axis=2)
     log = np.log(power / (len(rows) * len(columns)) + 1)
     found = cv2.dft(log, flags=cv2.DFT_COMPLEX_OUTPUT | cv2.DFT_SCALE)[:, :, 0]
     return np.asarray(cv2.GaussianBlur(np.fft.fftshift(found), (0, 0), 0.7), np.float32)
+
+
+def _starts(size: int) -> IntArray:
+    """Where pieces of a side of `size` pixels begin."""
+    count = 1 if size <= BLOCK else 2 + (size > 2 * BLOCK)
+    return np.asarray(np.linspace(0, max(size - BLOCK, 0), count), np.int32)
 
 
 @lru_cache(maxsize=1)

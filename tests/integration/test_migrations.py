@@ -205,6 +205,22 @@ def test_landmarks_of_before_get_visits(engine: Engine, empty_url: str) -> None:
         assert connection.execute(text("SELECT COUNT(*) FROM landmark_visit_list")).scalar() == 7
 
 
+def test_keyframes_of_before_have_no_quality(engine: Engine, empty_url: str) -> None:
+    schema.upgrade(engine)
+    with open_store(empty_url) as store:
+        _, _, ids = fill(store)
+    schema.downgrade(engine, "0012")
+    assert "keyframe_qualities" not in inspect(engine).get_table_names()
+    schema.upgrade(engine)
+    with open_store(empty_url) as store:
+        assert len(store.load_keyframes(ids)) == len(ids)
+    with engine.begin() as connection:
+        columns = "keyframe_id, sharpness, exposure, contrast, blur_px, blur_deg"
+        connection.execute(text(f"INSERT INTO keyframe_qualities ({columns}) VALUES ({ids[0]}, 20, 0.5, 0.4, 0, 0)"))
+        row = connection.execute(text("SELECT * FROM keyframe_quality")).one()._mapping
+        assert (row["keyframe_id"], row["contrast"], row["keypoints"] > 0) == (ids[0], 0.4, True)
+
+
 def test_a_database_of_before_gets_tokens(engine: Engine, empty_url: str) -> None:
     schema.upgrade(engine)
     with open_store(empty_url) as store:

@@ -47,7 +47,14 @@ def test_no_motion_is_found_where_there_is_none(seed: int) -> None:
         assert motion_blur(image) is None
     noise = np.random.default_rng(seed).integers(0, 256, (480, 640)).astype(np.uint8)
     assert motion_blur(noise) is None
-    assert motion_blur(scene(seed)[:200]) is None  # too small to say
+    assert motion_blur(scene(seed)[:120]) is None  # too small to say
+
+
+def test_motion_is_found_in_small_images() -> None:
+    small = blurred_like(cv2.resize(scene(), (320, 240), interpolation=cv2.INTER_AREA), (15, 60))
+    found = motion_blur(small)
+    assert found is not None
+    assert found == (pytest.approx(15, abs=1), pytest.approx(60, abs=5))
 
 
 def test_a_kernel_is_the_motion() -> None:
