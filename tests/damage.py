@@ -114,6 +114,7 @@ def settings(folder: Path) -> Settings:
         threads=1,
         max_keypoints=200,
         cache_dir=folder / "cache",
+        descriptor_dtype="float32",  # rows whose numbers can be damaged one by one
     )
 
 
