@@ -4,9 +4,9 @@ import { type Updatable, go, match } from "./router";
 import { routes } from "./routes";
 import { shell } from "./shell";
 import { texts } from "./texts";
-import { fill } from "./ui/h";
+import { fill, h } from "./ui/h";
 import { listenToKeys } from "./ui/keys";
-import { empty, a, failed, followLinks } from "./ui/parts";
+import { a, failed, followLinks } from "./ui/parts";
 import { followTheme } from "./ui/theme";
 import { askForToken } from "./ui/token";
 
@@ -32,7 +32,9 @@ async function navigate(anew = false): Promise<void> {
   document.title = texts.title(texts.product);
   fill(main);
   if (!found) {
-    fill(main, empty(texts.errors.notFound, texts.errors.notFoundHint, a("/maps", null, texts.errors.toMaps)));
+    document.title = texts.title(texts.errors.notFound);
+    main.className = "page";
+    fill(main, h("h1", null, texts.errors.notFound), h("p", null, texts.errors.notFoundHint), h("p", null, a("/maps", null, texts.errors.toMaps)));
     return;
   }
   try {
