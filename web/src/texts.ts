@@ -91,7 +91,7 @@ export const texts = {
     home: "Show all",
     legend: [
       ["camera", "keyframes: where images were taken"],
-      ["box", "things, coloured by class"],
+      ["thing", "things, coloured by class"],
       ["click", "click either to see more"],
     ] as [string, string][],
     layersLabel: "Layers",

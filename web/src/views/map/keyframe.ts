@@ -143,7 +143,7 @@ function seenList(context: MapContext, objects: readonly SeenObject[], sightings
   const landmarkOf = new Map(sightings.map((one) => [one.ordinal, one.landmark]));
   return h(
     "ul",
-    { class: "rows" },
+    { class: "row-list" },
     objects.map((thing, index) => {
       const mark = h("span", { class: "dot" });
       mark.style.background = css(hueColour(index, theme.get() === "dark"));
@@ -180,7 +180,7 @@ function usedList(mapName: string, item: KeyframeItem, queries: readonly LoggedQ
   if (queries.length === 0) return h("p", { class: "faint" }, texts.keyframe.unused);
   return h(
     "ul",
-    { class: "rows" },
+    { class: "row-list" },
     queries.map((query) => {
       const mine = query.candidates.find((one) => one.keyframe === item.id);
       return h(

@@ -114,7 +114,7 @@ function relations(context: MapContext, item: LandmarkItem, found: readonly Rela
   if (mine.length === 0) return h("p", { class: "faint" }, texts.landmark.noRelations);
   return h(
     "ul",
-    { class: "rows" },
+    { class: "row-list" },
     mine.slice(0, 12).map((one) => {
       const other = context.scene.landmark(one.other_landmark);
       const name = other ? other.category : String(one.other_landmark);
@@ -134,7 +134,7 @@ function visits(found: readonly Visit[]): Child {
   if (found.length === 0) return h("p", { class: "faint" }, texts.landmark.noVisits);
   return h(
     "ul",
-    { class: "rows" },
+    { class: "row-list" },
     found.map((one) =>
       h(
         "li",
@@ -151,7 +151,7 @@ function sightings(context: MapContext, found: readonly Sighting[]): Child {
   const shown = found.slice(0, 40);
   return h(
     "ul",
-    { class: "rows" },
+    { class: "row-list" },
     shown.map((one) =>
       h(
         "li",

@@ -31,7 +31,7 @@ export class Panel {
     this.tabs = (["things", "frames"] as const).map((name) =>
       h("button", { attrs: { type: "button", role: "tab" }, on: { click: () => this.open(name) } }, name === "things" ? texts.map.things : texts.map.keyframes),
     );
-    this.element.append(h("div", { class: "tabs", attrs: { role: "tablist" } }, this.tabs), h("div", { class: "panel-filter" }, this.filter), this.body);
+    this.element.append(h("div", { class: "panel-tabs", attrs: { role: "tablist" } }, this.tabs), h("div", { class: "panel-filter" }, this.filter), this.body);
     theme.watch(() => this.list(), until);
     this.open(scene.landmarks.length > 0 || scene.keyframes.length === 0 ? "things" : "frames");
   }
