@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -99,15 +101,27 @@ def write(
     from semdb.trajectory.files import summary, trajectory_text
 
     if out is not None:
-        out.write_text(trajectory_text(found), encoding="utf-8")
+        with named(out):
+            out.write_text(trajectory_text(found), encoding="utf-8")
     if json_file is not None:
-        with json_file.open("w", encoding="utf-8") as stream:
+        with named(json_file), json_file.open("w", encoding="utf-8") as stream:
             print_json({"recording": recording.name, **summary(found, seconds)}, stream)
     if plot is not None:
         name = re.sub(r"[^\w.+-]+", "_", recording.name).strip("_.") or "recording"
         picture = plot / f"{name}-trajectory.png"
-        picture.write_bytes(picture_of(found, recording))
+        with named(picture):
+            picture.write_bytes(picture_of(found, recording))
         say(f"wrote {picture}")
+
+
+@contextlib.contextmanager
+def named(file: Path) -> Iterator[None]:
+    """Says of which file it is that it cannot be written: a full disk does not."""
+    try:
+        yield
+    except OSError as error:
+        error.filename = error.filename or str(file)
+        raise
 
 
 def picture_of(found: RecordedTrajectory, recording: Recording) -> bytes:

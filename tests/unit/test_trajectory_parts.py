@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from semdb.cli.trajectory import named
 from semdb.evaluation.pose_comparison import compare_poses
 from semdb.evaluation.trajectory_errors import rigid_alignment, trajectory_errors
 from semdb.geometry import invert_pose, pose_error, pose_from, so3_exp, transform_points
@@ -247,3 +248,8 @@ def test_comparison_of_poses_finds_scale_and_the_worst_frame() -> None:
     few = compare_poses(RecordedTrajectory(Trajectory(frames[:2], (), (), pieces, (), 0.0, {}), entries, True))
     assert few.errors is None
     assert few.frames == 2
+
+
+def test_a_file_that_cannot_be_written_is_named() -> None:
+    with pytest.raises(OSError, match="No space left on device: '/dev/full'"), named(Path("/dev/full")):
+        Path("/dev/full").write_text("0 0 0 0 0 0 0 1\n")
