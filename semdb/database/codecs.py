@@ -107,12 +107,7 @@ def decode_vectors(
     if not len(blobs):
         return np.empty((0, size or 0), np.float32)
     joined = _equal_vectors(blobs)
-    if (
-        joined is not None
-        and size in (None, joined.shape[1])
-        and joined.max() <= _MOST_OF_UNIT
-        and joined.min() >= -_MOST_OF_UNIT
-    ):
+    if joined is not None and size in (None, joined.shape[1]) and (np.abs(joined) <= _MOST_OF_UNIT).all():
         return joined
     found = [_vector(blob, int(key)) for blob, key in zip(blobs, keys, strict=True)]
     sizes = Counter(len(vector) for vector in found if not isinstance(vector, CodecError))

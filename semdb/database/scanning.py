@@ -9,28 +9,14 @@ from functools import partial, reduce
 from typing import Any
 
 import numpy as np
-from sqlalchemy import (
-    BigInteger,
-    Connection,
-    Engine,
-    Select,
-    and_,
-    bindparam,
-    case,
-    cast,
-    func,
-    literal,
-    literal_column,
-    not_,
-    select,
-)
+from sqlalchemy import BigInteger, Connection, Engine, Select, and_, case, cast, func, literal, not_, select
 from sqlalchemy.sql.elements import ColumnElement
 
 from semdb.class_score import MOST_OBJECTS, Part, word
 from semdb.database import checked, retry
 from semdb.database.codecs import decode_vectors
 from semdb.database.exact_sums import exact_sum, whole
-from semdb.database.reading import Bad
+from semdb.database.reading import Bad, keyframe_ids
 from semdb.database.tables import categories, cnn_vectors, keyframe_categories, keyframes, maps, recordings
 from semdb.errors import CodecError
 from semdb.types import Float32Array, Int64Array
@@ -39,8 +25,6 @@ IN_CHUNK = 500
 FETCH = 50_000  # numbers at a time
 IDS_IN_A_ROW = 48  # at most 20 bytes each: servers cut a joined text off at 1024 bytes, unless told otherwise
 _LARGEST_ID = 2**63 // (MOST_OBJECTS + 1) ** 3 - 1  # that is packed with three numbers
-JOINED = 64  # vectors in one value: half a MiB
-_HEAD = 24  # characters of an id and a length
 DENSE = 0.5  # of the ids of a range that are wanted: from here on the range is read, not a list of ids
 
 
@@ -52,25 +36,11 @@ def iter_vectors(
     Each chunk is a transaction of its own, so a keyframe that is deleted meanwhile is left out. `size` and `bad` as in
     `vectors_there`; without `size` it is that of the first chunk.
     """
-    ids = _map_ids(engine, map_id)
+    ids = np.array(keyframe_ids(engine, map_id), np.int64)
     for start in range(0, len(ids), chunk):
         found, vectors = vectors_there(engine, ids[start : start + chunk], size, bad)
         size = vectors.shape[1] if len(found) else size
         yield found, vectors
-
-
-def _map_ids(engine: Engine, map_id: int) -> Int64Array:
-    """The keyframes of a map ``[n]``, ascending; in several transactions."""
-    k = keyframes.c
-    query = select(k.id.label("number")).join(recordings, recordings.c.id == k.recording_id)
-    query = query.where(recordings.c.map_id == map_id).order_by(k.id).limit(FETCH)
-    pieces, last = [np.empty(0, np.int64)], -(2**63)
-    while True:
-        numbers = retry.read(engine, partial(_numbers, query=query.where(k.id > last), step=1))
-        pieces.append(numbers)
-        if len(numbers) < FETCH:
-            return np.concatenate(pieces)
-        last = int(numbers[-1])
 
 
 def vectors_there(
@@ -180,7 +150,7 @@ def _numbers(connection: Connection, query: Select[tuple[int]], step: int) -> In
     width = literal(step * IDS_IN_A_ROW, BigInteger)
     texts = select(func.group_concat(rows.number)).group_by(rows.number - rows.number % width)
     found = ",".join(str(text) for text in connection.execute(texts).scalars())
-    return np.sort(np.fromstring(found, np.int64, sep=",")) if found else np.empty(0, np.int64)
+    return np.sort(np.array(found.split(","), np.int64)) if found else np.empty(0, np.int64)
 
 
 def _at_most(column: ColumnElement[int]) -> ColumnElement[int]:
@@ -260,8 +230,6 @@ def _rows(connection: Connection, ids: Int64Array) -> list[tuple[int, bytes]]:
     first, last = int(ids[0]), int(ids[-1])
     if len(ids) >= DENSE * (last - first + 1):
         keys = set(ids.tolist())
-        if connection.dialect.name != "sqlite":
-            return [row for row in _joined_rows(connection, first, last) if row[0] in keys]
         found = connection.execute(query.where(c.keyframe_id.between(first, last)))
         return [(row[0], row[1]) for row in found if row[0] in keys]
     return [
@@ -269,46 +237,6 @@ def _rows(connection: Connection, ids: Int64Array) -> list[tuple[int, bytes]]:
         for keys in _in_chunks(ids.tolist())
         for row in connection.execute(query.where(c.keyframe_id.in_(keys)))
     ]
-
-
-def _joined_rows(connection: Connection, first: int, last: int) -> Iterator[tuple[int, bytes]]:
-    """Vectors of a range of ids, `JOINED` of them in one value: drivers in Python take longest for rows and packets.
-
-    A value that came shorter than it should (the server's limits of values and packets are the account's, not ours)
-    is read again row by row.
-    """
-    c = cnn_vectors.c
-    limit = "SET SESSION group_concat_max_len = " + str(JOINED * (checked.MOST_VECTOR + _HEAD))
-    connection.exec_driver_sql(limit)
-    blob = checked.up_to(c.vector, checked.MOST_VECTOR)
-    head = func.concat(func.lpad(func.hex(c.keyframe_id), 16, "0"), func.lpad(func.hex(func.length(blob)), 8, "0"))
-    joined = func.group_concat(func.concat(head, blob).op("SEPARATOR")(literal_column("''")))
-    between = c.keyframe_id.between(bindparam("first"), bindparam("last"))
-    together, apart = select(joined, func.count()).where(between), select(c.keyframe_id, blob).where(between)
-    for start in range(first, last + 1, JOINED):
-        asked = {"first": start, "last": min(last, start + JOINED - 1)}
-        value, count = connection.execute(together, asked).one()
-        rows = _parted(value)
-        if rows is None or len(rows) != count:
-            rows = [(int(key), data) for key, data in connection.execute(apart, asked)]
-        yield from rows
-
-
-def _parted(value: Any) -> list[tuple[int, bytes]] | None:
-    """The rows of one value; None for one that is cut off."""
-    if value is None:
-        return []
-    found, at, end = [], 0, len(value)
-    while at < end:
-        try:
-            key, size = int(value[at : at + 16], 16), int(value[at + 16 : at + _HEAD], 16)
-        except ValueError:
-            return None
-        at += _HEAD + size
-        if at > end:
-            return None
-        found.append((key, value[at - size : at]))
-    return found
 
 
 def _without_row(connection: Connection, ids: Int64Array, rows: Sequence[tuple[int, bytes]]) -> list[int]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -40,7 +39,7 @@ def load_mirror(
             if progress is not None:
                 progress(min(done, expected), expected)
 
-    parts = _parts(pieces(), folder, expected)
+    parts = _parts(pieces(), folder)
     ids = np.concatenate(read) if read else np.empty(0, np.int64)
     columns: dict[str, tuple[Int64Array, Int64Array]] = {}
     for key, name in store.map_categories(map_id):
@@ -52,7 +51,7 @@ def load_mirror(
     return mirror
 
 
-def _parts(pieces: Iterator[Float32Array], folder: CacheFolder | None, expected: int) -> list[Part]:
+def _parts(pieces: Iterator[Float32Array], folder: CacheFolder | None) -> list[Part]:
     first = next((piece for piece in pieces if len(piece)), None)
     if first is None:
         return []
@@ -63,19 +62,7 @@ def _parts(pieces: Iterator[Float32Array], folder: CacheFolder | None, expected:
 
     if folder is not None:
         return folder.store_vectors(all_pieces(), first.shape[1])
-    return [Part(_joined(all_pieces(), expected))]
-
-
-def _joined(pieces: Iterator[Float32Array], expected: int) -> Float32Array:
-    """The rows of all pieces, of which about `expected` are; copied once."""
-    first = next(pieces)
-    out, done = np.empty((max(expected, len(first)), first.shape[1]), np.float32), 0
-    for piece in itertools.chain((first,), pieces):
-        if done + len(piece) > len(out):  # more were written meanwhile
-            out = np.concatenate([out[:done], np.empty((len(piece) + len(out) // 8, out.shape[1]), np.float32)])
-        out[done : done + len(piece)] = piece
-        done += len(piece)
-    return out[:done]
+    return [Part(np.concatenate(list(all_pieces())))]
 
 
 def same_as_database(store: Store, map_id: int, mirror: Mirror, state: State) -> bool:
