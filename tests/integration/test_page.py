@@ -268,6 +268,7 @@ def test_every_view_is_accessible_on_a_phone_too(browser: Any, served: Served, d
     with visiting(browser, served.url, phone=dark, dark=dark) as visit:
         for view in views:
             visit.go(f"/{view}")
+            visit.page.wait_for_timeout(400)  # for what comes a little later
             visit.shot(f"{view.replace('/', '-')}-{'phone-dark' if dark else 'light'}")
             visit.check_accessible(view)
             if dark:
