@@ -77,6 +77,9 @@ class Settings(BaseSettings):
         "auto", description="auto, onnx:FILE, torchvision:NAME or gist. auto: a query takes the map's own"
     )
     features: str = Field("auto", description="auto, surf, sift, orb or onnx:FILE. auto: the map's own, or surf")
+    features_fallback: str | None = Field(
+        None, description="a feature that is asked where that of the map does not convince, as onnx:FILE; default: none"
+    )
     matcher: str | None = Field(
         None, description="onnx:FILE: a network that matches learned features; default: nearest neighbours"
     )

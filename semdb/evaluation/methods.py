@@ -94,6 +94,7 @@ METHODS = {
                 edges=None,
                 blur=None,
                 landmarks=None,
+                fallback=False,
             ),
         ),
         Method(
@@ -110,6 +111,7 @@ METHODS = {
                 edges=None,
                 blur=None,
                 landmarks=None,
+                fallback=False,
             ),
             features="orb",
         ),
@@ -140,6 +142,11 @@ METHODS = {
             "semdb-no-edges",
             "as semdb without laying the edges of queries on those of the map",
             LocalizerOptions(edges=None),
+        ),
+        Method(
+            "semdb-no-fallback",
+            "as semdb without asking another feature (SEMDB_FEATURES_FALLBACK) where keypoints do not convince",
+            LocalizerOptions(fallback=False),
         ),
         Method("hard", "as semdb with the hard class filter alone", LocalizerOptions(coarse=_HARD)),
         Method(

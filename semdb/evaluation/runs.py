@@ -27,7 +27,7 @@ from semdb.evaluation.regression import (
 from semdb.evaluation.retrieval import FIRST, reach
 from semdb.evaluation.tasks import Part, Task
 from semdb.ingestion.run import IngestOptions, ingest_recording
-from semdb.localization.images import make_localizer, with_matcher
+from semdb.localization.images import fallback_of, make_localizer, with_matcher
 from semdb.localization.localizer import Localizer
 from semdb.localization.query_image import frame_at_scale
 from semdb.perception.describe import Describer, describer_from_specs
@@ -297,7 +297,8 @@ def open_run(
     info = store.find_map(map_name)
     if method.features is None:  # those that name their feature name their matching too
         options = with_matcher(options, describers.settings, store.map_models(info.id))
-    localizer = make_localizer(store, info, coarse, options)
+    fallback = fallback_of(describers.settings, store.map_models(info.id)) if options.fallback else None
+    localizer = make_localizer(store, info, coarse, options, fallback=fallback)
     run = OracleRun if method.name.startswith(ORACLE) else LocalizerRun
     return run(method, describer, localizer, query_depth or method.query_depth, store)
 

@@ -10,12 +10,14 @@ from semdb.database.refinements import CLASSES
 from semdb.database.store import Store
 from semdb.errors import UsageError
 from semdb.localization.coarse import CoarseSource
+from semdb.localization.fallback import Fallback
 from semdb.localization.index import IndexOptions, IndexSource, MapIndex
 from semdb.localization.keyframe_cache import STALE, KeyframeCache
 from semdb.localization.learned_matching import is_learned
 from semdb.localization.localizer import Localizer, LocalizerOptions
 from semdb.localization.query_image import QueryImage
 from semdb.localization.sources import SqlSource
+from semdb.perception.model_choice import dynamic_classes
 from semdb.settings import Settings
 from semdb.types import Description, Localization, ModelInfo
 
@@ -45,6 +47,7 @@ def make_localizer(
     *,
     settings: Settings | None = None,
     say: Callable[[str], None] | None = None,
+    fallback: Fallback | None = None,
 ) -> Localizer:
     """The localizer of one map. Raises UsageError for a `coarse` that is neither ``sql`` nor ``index``.
 
@@ -53,7 +56,7 @@ def make_localizer(
     """
     check_coarse(coarse)
     source = SqlSource(store, info.id) if coarse == "sql" else IndexSource(open_index(store, info.id, settings, say))
-    return localizer_on(source, store, info, options, settings=settings, say=say)
+    return localizer_on(source, store, info, options, settings=settings, say=say, fallback=fallback)
 
 
 def localizer_on(
@@ -64,8 +67,9 @@ def localizer_on(
     *,
     settings: Settings | None = None,
     say: Callable[[str], None] | None = None,
+    fallback: Fallback | None = None,
 ) -> Localizer:
-    """The localizer of one map whose coarse step asks `source`."""
+    """The localizer of one map whose coarse step asks `source`; `fallback` in place of that of the settings."""
     store.say_class_rows_that_are_none(info.id)
     confusions: dict[str, dict[str, int]] = {}
     if say is not None and any(item.kind == CLASSES and not item.current for item in store.refinements(info.id)):
@@ -75,10 +79,31 @@ def localizer_on(
     models = store.map_models(info.id)
     if settings is not None:
         options = with_matcher((options or LocalizerOptions()).with_threads(settings.threads), settings, models)
-    cache = KeyframeCache(store, info.id, refined=options is None or options.refined_points)
+        fallback = fallback or fallback_of(settings, models)
+    options = options or LocalizerOptions()
+    cache = KeyframeCache(
+        store, info.id, refined=options.refined_points, fallback=fallback if options.fallback else None
+    )
     if say is not None and cache.points == STALE:
         say(f"map {info.name!r} has changed since semdb refine; its refined points are not used: run semdb refine")
     return Localizer(info.name, models, source, cache, options, confusions)
+
+
+def fallback_of(settings: Settings, models: Sequence[ModelInfo]) -> Fallback | None:
+    """The other feature that `settings` name for a map of `models`, with their matcher; None where it is the map's.
+
+    Raises UsageError for a spec that is none, ModelError where a file is missing or is not what it should be.
+    """
+    if settings.features_fallback is None or not models:
+        return None
+    from semdb.perception.features import load_features
+    from semdb.perception.matchers import load_matcher
+
+    extractor = load_features(settings.features_fallback, settings)
+    if extractor.info in models:
+        return None
+    matcher = None if settings.matcher is None else load_matcher(settings.matcher, settings)
+    return Fallback(extractor, matcher, dynamic_classes(models))
 
 
 def with_matcher(options: LocalizerOptions, settings: Settings, models: Sequence[ModelInfo]) -> LocalizerOptions:
@@ -86,7 +111,7 @@ def with_matcher(options: LocalizerOptions, settings: Settings, models: Sequence
 
     Raises UsageError where the `models` of the map have no learned feature, or there is no such file.
     """
-    if settings.matcher is None or not models:
+    if settings.matcher is None or not models or (settings.features_fallback and not is_learned(models)):
         return options
     feature = next((model.name for model in models if model.role == "features"), "none")
     if not is_learned(models):

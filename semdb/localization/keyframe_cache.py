@@ -20,6 +20,7 @@ from semdb.geometry import POSE_UNIT_M, pose_distances
 from semdb.geometry.sensor import depth_noise
 from semdb.localization.coarse import MapChange
 from semdb.localization.edges import PlacedEdges
+from semdb.localization.fallback import Fallback, fallback_cache
 from semdb.localization.landmark_pose import MapLandmarks
 from semdb.localization.map_landmarks import read_map_landmarks
 from semdb.localization.shape_cache import Local, ShapeCache, There, edge_cache, surface_cache
@@ -39,7 +40,9 @@ class KeyframeCache:
     share it: they take turns.
     """
 
-    def __init__(self, store: Store, map_id: int, capacity: int = 64, *, refined: bool = True) -> None:
+    def __init__(
+        self, store: Store, map_id: int, capacity: int = 64, *, refined: bool = True, fallback: Fallback | None = None
+    ) -> None:
         self.numbers = ClassNumbers()
         self._turn = threading.RLock()
         self.store = store
@@ -50,6 +53,8 @@ class KeyframeCache:
         self._poses: tuple[list[int], FloatArray] | None = None
         self._stale: set[int] = set()  # keyframes whose poses are to be read again
         self._surfaces, self._edges = surface_cache(store), edge_cache(store)
+        self.fallback = fallback
+        self._others = None if fallback is None else fallback_cache(store, fallback, self.numbers)
         self._landmarks: MapLandmarks | None = None
         self._landmarks_read = False
         self._refined = refined
@@ -76,8 +81,11 @@ class KeyframeCache:
                 self._views.clear()  # their points belong to the map as it was
             self._points = None
         self._landmarks, self._landmarks_read = None, False
+        gone = None if change.everything else change.added | change.gone
         for shapes in (self._surfaces, self._edges):
-            shapes.forget(None if change.everything else change.added | change.gone)
+            shapes.forget(gone)
+        if self._others is not None:
+            self._others.forget(gone)
         if change.everything:
             self._views.clear()
             self._names.clear()
@@ -109,6 +117,18 @@ class KeyframeCache:
             while len(self._views) > self._capacity:
                 self._views.popitem(last=False)
             return found
+
+    def fallback_views(self, keyframe_ids: Sequence[int]) -> list[KeyframeView]:
+        """As `views`, with keypoints of the fallback; a keyframe without depth is left out. Raises ModelError."""
+        if self._others is None:
+            return []
+        found = []
+        for own in self.views(keyframe_ids):
+            with self._turn:
+                view = self._others.placed(own.keyframe_id, own.world_from_camera)
+            if view is not None:
+                found.append(replace(view, pose_sigma=own.pose_sigma))
+        return found
 
     def _load(self, missing: Sequence[int]) -> None:
         if not missing:

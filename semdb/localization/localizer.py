@@ -27,6 +27,7 @@ from semdb.localization.confidence import Evidence
 from semdb.localization.edge_alignment import measure_edges, search_edges
 from semdb.localization.edge_step import EdgeVerdictOptions, weigh_edges
 from semdb.localization.edges import image_edges
+from semdb.localization.fallback import Fallback, FallbackOptions, asked_first, fallback_numbers, weigh_fallback
 from semdb.localization.keyframe_cache import KeyframeCache
 from semdb.localization.laid_pose import LaidOptions, LaidPose, estimate_with, is_one, judge_with, may_overrule
 from semdb.localization.landmark_pose import LandmarkPoseOptions
@@ -61,6 +62,8 @@ from semdb.types import (
     Verdict,
 )
 
+Settled = tuple[bool, Judgement, Evidence | None]  # whether a first pose convinced, and what is made of the last
+
 FAR = 4.0  # of `pose_distances`: keyframes nearer than this may see the same things
 ASKED_BY_SIDE = 6  # so many of the nearest are candidates for each neighbour
 
@@ -79,6 +82,7 @@ class LocalizerOptions:
     edges: EdgeVerdictOptions | None = field(default_factory=EdgeVerdictOptions)  # where neither convinces
     blur: BlurOptions | None = field(default_factory=BlurOptions)  # of a query that motion has blurred
     landmarks: LandmarkPoseOptions | None = field(default_factory=LandmarkPoseOptions)  # where keypoints fail
+    fallback: bool = True  # whether the other feature is asked that settings name, where keypoints do not convince
     accept: Tolerance | None = None  # how far poses may differ that are one, where a query does not say
     twin_cosine: float = 0.05  # how much less than the best keyframe's cosine is "as much"
 
@@ -122,7 +126,7 @@ class Localizer:
         Raises ProvenanceError when other models made the map, NotFoundError when the map holds no keyframe, CodecError
         where none that can be used is found among damaged ones.
         """
-        search = Search(self._view_of(description), self._check(description), accept or self.options.accept)
+        search = self._search(description, accept or self.options.accept)
         source = TimedSource(self.source)
         started = time.perf_counter()
         for batch in cascade(source, self._classes(description), description.cnn_vector, self.options.coarse):
@@ -151,7 +155,7 @@ class Localizer:
 
     def localize_among(self, description: Description, keyframe_ids: Sequence[int]) -> Localization:
         """The fine step alone, on keyframes that the caller names (the `oracle` of evaluations)."""
-        search = Search(self._view_of(description), self._check(description), self.options.accept)
+        search = self._search(description, self.options.accept)
         proposals = tuple(Proposal(i, float("nan"), float("nan")) for i in keyframe_ids)
         self._try(search, Batch(Stage.GIVEN, proposals, 0))
         return self._conclude(search, description)
@@ -170,6 +174,9 @@ class Localizer:
             raise NotFoundError(f"map {self.map_name!r} holds no keyframe: ingest a recording into it first")
         check_models(self.models, description.models, f"the map {self.map_name!r}")
         return keyframes
+
+    def _search(self, description: Description, accept: Tolerance | None) -> Search:
+        return Search(self._view_of(description), self._check(description), self.options.pose, accept)
 
     def _view_of(self, description: Description) -> View:
         categories = [detection.category for detection in description.detections]
@@ -204,37 +211,32 @@ class Localizer:
         search.following = batch.following
         self._match(search, [proposal.keyframe_id for proposal in batch.proposals])
         started = time.perf_counter()
-        search.first = first_pose(search.query, search.keyframes, search.matches, self.options.pose)
+        search.first = first_pose(search.query, search.keyframes, search.matches, search.pose)
         search.timing_ms["pose"] += _ms_since(started)
 
     def _match(self, search: Search, keyframe_ids: Sequence[int]) -> None:
         started = time.perf_counter()
-        keyframes = self.cache.views(keyframe_ids, None if search.blurred else search.query.descriptors)
+        if search.fallback:
+            keyframes = self.cache.fallback_views(keyframe_ids)
+        else:
+            keyframes = self.cache.views(keyframe_ids, None if search.blurred else search.query.descriptors)
         if search.blurred is not None:
             keyframes = search.blurred.views(keyframes, self.options.pose.threads)
         search.keyframes += keyframes
         search.query = in_kind_of(keyframes, search.query)
-        search.matches += match_views(search.query, keyframes, self.options.pose)
+        search.matches += match_views(search.query, keyframes, search.pose)
         search.timing_ms["match"] += _ms_since(started)
 
     def _conclude(self, search: Search, description: Description) -> Localization:
         damaged = [p.keyframe_id for p in search.proposals if p.keyframe_id in self.cache.left_out]
         if damaged and not search.keyframes:
             raise self.cache.left_out[damaged[0]]
-        convinced = convinces(search.first, self.options.verdict) and search.stage != Stage.GIVEN
-        if convinced:
-            self._ask_neighbours(search)
-        self._estimate(search)
-        if convinced:
-            self._ask_twins(search)
+        convinced, judgement, evidence = self._settle(search)
+        if judgement.verdict is not Verdict.LOCALIZED and self.cache.fallback is not None:
+            search, convinced, judgement, evidence = self._ask_fallback(
+                search, self.cache.fallback, description, (convinced, judgement, evidence)
+            )
         started = time.perf_counter()
-        evidence, bounds = None, self.options.verdict.accepting(search.accept)
-        if search.estimate is not None:
-            rival = self._rival(search, search.estimate)
-            evidence = evidence_of(search, search.estimate, 0 if rival is None else rival.inliers)
-            if rival is not None and rival.inliers > bounds.rival_share * evidence.first_of_best:
-                search.others.append(rival)
-        judgement = judge(evidence, bounds)
         if not convinced or judgement.verdict is not Verdict.LOCALIZED:
             for lay, options in ((self._lay_surfaces, self.options.surfaces), (self._lay_edges, self.options.edges)):
                 laid = lay(search, description) if search.keyframes else None
@@ -250,6 +252,57 @@ class Localizer:
             wrong = complaint_of(image_quality(description.grey, description.stretch))
             judgement = replace(judgement, reason="; ".join(filter(None, (judgement.reason, wrong))))
         return self._result(search, judgement, evidence)
+
+    def _settle(self, search: Search) -> Settled:
+        """The last pose of all that was matched, and what the keypoints alone say of it."""
+        convinced = convinces(search.first, self.options.verdict) and search.stage != Stage.GIVEN
+        if convinced:
+            self._ask_neighbours(search)
+        self._estimate(search)
+        if convinced:
+            self._ask_twins(search)
+        started = time.perf_counter()
+        evidence, bounds = None, self.options.verdict.accepting(search.accept)
+        if search.estimate is not None:
+            rival = self._rival(search, search.estimate)
+            evidence = evidence_of(search, search.estimate, 0 if rival is None else rival.inliers)
+            if rival is not None and rival.inliers > bounds.rival_share * evidence.first_of_best:
+                search.others.append(rival)
+        search.timing_ms["pose"] += _ms_since(started)
+        return convinced, judge(evidence, bounds), evidence
+
+    def _ask_fallback(
+        self, search: Search, fallback: Fallback, description: Description, settled: Settled
+    ) -> tuple[Search, bool, Judgement, Evidence | None]:
+        """What another feature makes of the same keyframes, where both together are sure."""
+        started = time.perf_counter()
+        query = fallback.view_of(description, self.cache.numbers) if search.keyframes else None
+        search.timing_ms["fallback"] = _ms_since(started)
+        if query is None:
+            return search, *settled
+        pose = fallback.pose_options(self.options.pose)
+        again = replace(
+            search, query=query, pose=pose, fallback=fallback.name, blurred=None, keyframes=[], matches=[], first=None,
+            estimate=None, others=[], proposals=list(search.proposals),
+        )  # fmt: skip
+        for batch in asked_first(search.keyframes, search.estimate.per_keyframe if search.estimate else ()):
+            self._match(again, batch)
+            again.first = first_pose(query, again.keyframes, again.matches, pose)
+            if convinces(again.first, self.options.verdict):
+                break
+        found = self._settle(again) if again.keyframes else settled
+        if again.estimate is None or found[2] is None:
+            return search, *settled
+        said = fallback_numbers(search.estimate, again.estimate, found[2], found[1].confidence)
+        search.fallback_numbers = again.fallback_numbers = said
+        bounds, (_, _, evidence) = self.options.verdict.accepting(search.accept), settled
+        judgement = weigh_fallback(
+            search.estimate, evidence, again.estimate, found[2], found[1], FallbackOptions(), bounds, search.accept
+        )
+        if judgement is None:
+            return search, *settled
+        reason = f"{again.estimate.inliers} keypoints of {fallback.name} agree, and with the map's own"
+        return again, found[0], replace(judgement, reason=reason), found[2]
 
     def _by_landmarks(self, search: Search, description: Description, judgement: Judgement) -> Judgement:
         """What landmarks make of an image whose keypoints failed; its confidence stays that of the keypoints."""
@@ -280,8 +333,7 @@ class Localizer:
         before, overrule = search.estimate, False
         search.laid.append(laid)
         if laid.is_sure:
-            pose = self.options.pose
-            found = estimate_with(laid, search.query, search.keyframes, search.matches, options, pose)
+            found = estimate_with(laid, search.query, search.keyframes, search.matches, options, search.pose)
             rival = self._rival(search, found)
             anew = evidence_of(search, found, 0 if rival is None else rival.inliers)
             overrule = may_overrule(convinced, anew, laid, options)
@@ -295,7 +347,7 @@ class Localizer:
 
     def _rival(self, search: Search, estimate: PoseEstimate) -> ConsistentPose | None:
         """The best pose elsewhere that the caller would not accept for `estimate`."""
-        found = find_rival(search.query, search.keyframes, search.matches, estimate, self.options.pose)
+        found = find_rival(search.query, search.keyframes, search.matches, estimate, search.pose)
         if found is None or search.accept is None:
             return found
         return None if is_one(found.world_from_camera, estimate.world_from_camera, search.accept) else found
@@ -369,7 +421,7 @@ class Localizer:
         counts = dict.fromkeys((len(search.keyframes), search.first.keyframes))
         for count in counts:
             found = estimate_pose(
-                search.query, search.keyframes[:count], search.matches[:count], self.options.pose, search.first
+                search.query, search.keyframes[:count], search.matches[:count], search.pose, search.first
             )
             if search.estimate is None or (found is not None and found.inliers > search.estimate.inliers):
                 search.estimate = found

@@ -11,6 +11,7 @@ from semdb.localization.laid_pose import LaidPose
 from semdb.localization.landmark_pose import LandmarkPose
 from semdb.localization.matching import Matches
 from semdb.localization.pose import FirstPose, PoseEstimate
+from semdb.localization.pose_options import PoseOptions
 from semdb.localization.views import KeyframeView, View
 from semdb.types import ConsistentPose, Float32Array, Tolerance
 
@@ -21,6 +22,7 @@ class Search:
 
     query: View
     keyframes_in_map: int
+    pose: PoseOptions
     accept: Tolerance | None = None
     others: list[ConsistentPose] = field(default_factory=list)
     laid: list[LaidPose] = field(default_factory=list)
@@ -31,6 +33,8 @@ class Search:
     first: FirstPose | None = None
     blurred: BlurredKeyframes | None = None  # what makes its keyframes, where these are blurred like it
     estimate: PoseEstimate | None = None
+    fallback: str = ""  # the feature that `query` and `keyframes` are of, where it is not the map's
+    fallback_numbers: dict[str, float] = field(default_factory=dict)  # what another feature said
     following: tuple[Proposal, ...] = ()
     stage: str = Stage.FILTERED
     ranked: int = 0
@@ -42,6 +46,7 @@ def numbers_of(search: Search, evidence: Evidence | None) -> dict[str, float]:
     found = evidence.as_mapping() if evidence else {}
     for laid in search.laid:
         found |= laid.numbers
+    found |= search.fallback_numbers
     return found | (search.by_landmarks.as_mapping() if search.by_landmarks else {})
 
 

@@ -1,4 +1,4 @@
-"""Surfaces and edges of keyframes, made of their images when they are first asked for, the latest kept in memory."""
+"""What is made of images of keyframes when it is first asked for, the latest kept in memory: surfaces, edges."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
+from semdb.database.records import StoredKeyframe
 from semdb.database.store import Store
 from semdb.errors import CodecError, FrameError, NotFoundError
 from semdb.localization.edges import PlacedEdges, SpaceEdges, space_edges
@@ -15,7 +16,7 @@ from semdb.localization.surface_alignment import PlacedSurfaces, place
 from semdb.localization.surfaces import Surfaces, surfaces_of
 from semdb.recordings.images import decode_color_grey
 from semdb.recordings.registration import decode_registered_depth
-from semdb.types import Camera, Float32Array, FloatArray, ImageArray
+from semdb.types import Float32Array, FloatArray, ImageArray
 
 CAPACITY = 32  # keyframes; about 4 MiB each of surfaces, 0.4 of edges
 
@@ -34,13 +35,13 @@ There = TypeVar("There", bound=Placed)
 class ShapeCache(Generic[Local, There]):
     """What keyframes with depth show. Not safe for threads: its owner takes turns.
 
-    `made` makes it of camera, depth and grey image, `placed_at` moves it to the world.
+    `made` makes it of the keyframe, depth and grey image, `placed_at` moves it to the world.
     """
 
     def __init__(
         self,
         store: Store,
-        made: Callable[[Camera, Float32Array, ImageArray], Local | None],
+        made: Callable[[StoredKeyframe, Float32Array, ImageArray], Local | None],
         placed_at: Callable[[int, Local, FloatArray], There],
         capacity: int = CAPACITY,
     ) -> None:
@@ -80,7 +81,7 @@ class ShapeCache(Generic[Local, There]):
             registration, camera = files.depth_registration, stored.camera
             depth = decode_registered_depth(files.depth, name, files.depth_scale, registration, camera)
             grey = decode_color_grey(files.rgb, f"keyframe_images.rgb {where}")
-            return self._make(camera, depth, grey) if grey.shape == depth.shape else None
+            return self._make(stored, depth, grey) if grey.shape == depth.shape else None
         except NotFoundError:  # deleted a moment ago
             return None
         except (FrameError, CodecError) as error:
@@ -90,9 +91,9 @@ class ShapeCache(Generic[Local, There]):
 
 def surface_cache(store: Store) -> ShapeCache[Surfaces, PlacedSurfaces]:
     """Of the surfaces that a query's depth is laid on."""
-    return ShapeCache(store, surfaces_of, place)
+    return ShapeCache(store, lambda stored, depth, grey: surfaces_of(stored.camera, depth, grey), place)
 
 
 def edge_cache(store: Store) -> ShapeCache[SpaceEdges, PlacedEdges]:
     """Of the edges that a query's are laid on."""
-    return ShapeCache(store, space_edges, PlacedEdges.at)
+    return ShapeCache(store, lambda stored, depth, grey: space_edges(stored.camera, depth, grey), PlacedEdges.at)

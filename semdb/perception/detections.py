@@ -70,7 +70,11 @@ class DetectionRules:
 
     def still(self, detections: Sequence[Detection]) -> BoolArray | None:
         """Where features may lie ``[H, W]``: not on, nor close to, a dynamic object; None: all over."""
-        moving = [d.mask for d in detections if d.category in self.dynamic]
+        return self.still_of([(d.category, d.mask) for d in detections])
+
+    def still_of(self, objects: Sequence[tuple[str, BoolArray]]) -> BoolArray | None:
+        """The same for classes and masks."""
+        moving = [mask for category, mask in objects if category in self.dynamic]
         if not moving:
             return None
         covered = np.logical_or.reduce(moving).view(np.uint8)

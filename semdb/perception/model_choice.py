@@ -102,6 +102,11 @@ def settings_of_map(settings: Settings, map_models: Sequence[ModelInfo]) -> Sett
     return settings.model_copy(update=taken)
 
 
+def dynamic_classes(map_models: Sequence[ModelInfo]) -> frozenset[str]:
+    """Classes of objects that move, as the map's detector was told. Raises ModelError for what no semdb wrote."""
+    return frozenset(name for m in map_models if m.role == "detector" for name in _config(m).get("dynamic", ()))
+
+
 def _config(model: ModelInfo) -> dict[str, Any]:
     """What of a configuration settings take. Raises ModelError for what no semdb wrote."""
     try:

@@ -1,0 +1,143 @@
+"""Another local feature, asked where that of the map does not convince: a learned one sees the same from farther away.
+
+The map does not store its keypoints: they are made of images and depths of keyframes when these are first asked for,
+and kept in memory. So every map has them that has images and depth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from semdb.database.records import StoredKeyframe
+from semdb.database.store import Store
+from semdb.geometry import invert_pose, pose_error, transform_points
+from semdb.localization.confidence import Evidence
+from semdb.localization.learned_matching import KeypointMatcher, for_learned, is_learned
+from semdb.localization.pose import PoseEstimate
+from semdb.localization.pose_options import PoseOptions
+from semdb.localization.shape_cache import ShapeCache
+from semdb.localization.verdict import Judgement, VerdictOptions
+from semdb.localization.views import ClassNumbers, KeyframeView, View, make_view
+from semdb.perception.keypoints import find_keypoints
+from semdb.perception.protocols import FeatureExtractor
+from semdb.types import Description, Float32Array, FloatArray, ImageArray, Tolerance, Verdict
+
+CAPACITY = 128  # keyframes; about 0.6 MiB each
+BATCHES = (3, 7)  # keyframes that are asked, those with most pairs first
+
+
+@dataclass(frozen=True, slots=True)
+class FallbackOptions:
+    """When both features together are sure. Chosen on the red kitchen with 6 keyframes, two rendered rooms and rooms of
+    the same shapes: there the mean likeness is at most 0.52, of right poses far from keyframes 0.54 and more.
+    """
+
+    least_likeness: float = 0.54  # mean of both features' (`Evidence.likeness`)
+    least_confidence: float = 0.6  # of the fallback's pose
+    least_own: int = 16  # first inliers of the map's own feature, below which its pose says nothing
+    same: Tolerance = field(
+        default_factory=lambda: Tolerance(0.15, 5.0)
+    )  # how far the poses of two features may differ that are one
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fallback:
+    """A feature beside that of a map; `dynamic` are the classes on which none of its keypoints lie."""
+
+    extractor: FeatureExtractor
+    matcher: KeypointMatcher | None = None
+    dynamic: frozenset[str] = field(default_factory=frozenset)
+
+    @property
+    def name(self) -> str:
+        return self.extractor.info.name
+
+    def pose_options(self, options: PoseOptions) -> PoseOptions:
+        """`options` of the map's own feature with the thresholds of this one."""
+        matching = for_learned(options.matching) if is_learned([self.extractor.info]) else options.matching
+        return replace(options, matching=matching, matcher=self.matcher)
+
+    def view_of(self, description: Description, numbers: ClassNumbers) -> View | None:
+        """The view of a query; None where its image is not at hand."""
+        if description.grey is None:
+            return None
+        objects = [(found.category, found.mask) for found in description.detections]
+        keypoints = find_keypoints(
+            self.extractor, description.camera, description.grey, description.depth, objects, self.dynamic
+        )
+        names = [category for category, _ in objects]
+        return make_view(description.camera, keypoints, names, numbers, grey=description.grey)
+
+
+def fallback_cache(store: Store, fallback: Fallback, numbers: ClassNumbers) -> ShapeCache[View, KeyframeView]:
+    """Of the keypoints that `fallback` finds in keyframes."""
+
+    def made(stored: StoredKeyframe, depth: Float32Array, grey: ImageArray) -> View | None:
+        categories = [found.category for found in stored.objects]
+        objects = list(zip(categories, store.load_masks(stored.id), strict=True))
+        keypoints = find_keypoints(fallback.extractor, stored.camera, grey, depth, objects, fallback.dynamic)
+        return make_view(stored.camera, keypoints, categories, numbers, with_points_only=True, grey=grey)
+
+    return ShapeCache(store, made, placed_view, CAPACITY)
+
+
+def placed_view(keyframe_id: int, view: View, world_from_camera: FloatArray) -> KeyframeView:
+    """`view` with its points moved to the world."""
+    points = transform_points(world_from_camera, view.points)
+    return KeyframeView(keyframe_id, view, world_from_camera, invert_pose(world_from_camera), points)
+
+
+def asked_first(keyframes: Sequence[KeyframeView], pairs: Sequence[int]) -> list[list[int]]:
+    """Ids of `keyframes` in the batches in which they are asked: those with most `pairs` ``[n]`` first."""
+    order = np.argsort(-np.asarray([*pairs, *[0] * (len(keyframes) - len(pairs))]), kind="stable")
+    ids = [keyframes[n].keyframe_id for n in order]
+    first = BATCHES[0]
+    return [batch for batch in (ids[:first], ids[first : first + BATCHES[1]]) if batch]
+
+
+def fallback_numbers(
+    before: PoseEstimate | None, found: PoseEstimate, evidence: Evidence, confidence: float
+) -> dict[str, float]:
+    """What a fallback found, beside the evidence: how sure, of how many keypoints, and how far from the own pose."""
+    metres, degrees = (float("nan"), float("nan"))
+    if before is not None:
+        metres, degrees = pose_error(before.world_from_camera, found.world_from_camera)
+    names = ("inliers", "first_inliers", "agreement", "likeness")
+    numbers = {f"fallback_{name}": float(getattr(evidence, name)) for name in names}
+    return {**numbers, "fallback_confidence": confidence, "fallback_metres": metres, "fallback_degrees": degrees}
+
+
+def weigh_fallback(
+    before: PoseEstimate | None,
+    evidence: Evidence | None,
+    found: PoseEstimate,
+    anew: Evidence,
+    judgement: Judgement,
+    options: FallbackOptions,
+    bounds: VerdictOptions,
+    accept: Tolerance | None,
+) -> Judgement | None:
+    """The verdict that both features together give the pose that a fallback `found`; None where it is not sure.
+
+    `judgement` is that of the fallback alone, from its evidence `anew`; `before` and `evidence` are of the map's own
+    feature. Learned features match what is of one shape whatever its texture, so that they alone take a room of the
+    same shapes for the map's: the own feature has to find the pose too, not surely, and about the pairs of both what
+    is seen has to look alike.
+    """
+    if before is None or evidence is None or evidence.first_inliers < options.least_own:
+        return None
+    for one in (evidence, anew):  # two places are alike: each feature may take the one for the other
+        if one.rival > bounds.rival_share * one.first_of_best:
+            return None
+    limit = options.same if accept is None else Tolerance(max(options.same.metres, accept.metres), options.same.degrees)
+    metres, degrees = pose_error(before.world_from_camera, found.world_from_camera)
+    alike = (evidence.likeness + anew.likeness) / 2
+    sure = judgement.confidence >= options.least_confidence and alike >= options.least_likeness
+    enough = anew.inliers >= bounds.localized_inliers and anew.spread >= bounds.minimum_spread
+    precise = anew.sigma_m <= bounds.maximum_translation_sigma_m and anew.sigma_deg <= bounds.maximum_rotation_sigma_deg
+    if not (sure and enough and precise and metres <= limit.metres and degrees <= limit.degrees):
+        return None
+    return Judgement(Verdict.LOCALIZED, max(judgement.confidence, bounds.localized_confidence), judgement.reason)
