@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from semdb.byte_descriptors import from_bytes
+from semdb.byte_descriptors import as_float
 from semdb.localization.matching import BACKGROUND, Evidence, Matches, MatchingOptions
 from semdb.localization.views import View
 from semdb.types import Float32Array, IntArray, ModelInfo
@@ -53,15 +53,10 @@ def for_learned(options: MatchingOptions) -> MatchingOptions:
 def match_by(matcher: KeypointMatcher, query: View, keyframe: View, options: MatchingOptions) -> Matches:
     """What `matcher` pairs, sorted by the query's index."""
     sizes = [(view.camera.width, view.camera.height) for view in (query, keyframe)]
-    one, two = (_as_float(view.descriptors) for view in (query, keyframe))
+    one, two = (as_float(view.descriptors) for view in (query, keyframe))
     i, j = matcher.match(query.seen_xy, one, sizes[0], keyframe.seen_xy, two, sizes[1])
     same = (query.classes[i] == keyframe.classes[j]) & (query.classes[i] != BACKGROUND)
     if options.evidence is Evidence.OBJECTS:
         i, j, same = i[same], j[same], same[same]
     product = np.einsum("nd,nd->n", np.asarray(one[i], np.float32), np.asarray(two[j], np.float32))
     return Matches(i, j, np.asarray(np.maximum(2 - 2 * product, 0), np.float32), same)
-
-
-def _as_float(descriptors: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
-    """Descriptors of rows that hold bytes as the network knows them."""
-    return from_bytes(np.asarray(descriptors, np.int8)) if descriptors.dtype == np.int8 else descriptors
