@@ -221,14 +221,25 @@ class ReferenceRun(Run):
         return *self._reference.names[position], ()
 
 
-class FixedRun(Run):
-    """The methods that give one pose to whatever is asked."""
+class UnmatchedRun(Run):
+    """The methods that look for no keyframe; pictures show the nearest one all the same."""
 
     retrieves = False
 
-    def __init__(self, method: Method, poses: FloatArray) -> None:
-        super().__init__(method, (), poses)
-        self._pose = fixed_pose(method, poses)
+    def __init__(self, method: Method, models: tuple[ModelInfo, ...], task: Task) -> None:
+        super().__init__(method, models, keyframe_poses(task))
+        self._names = [(part.recording.name, entry.index) for part in task.keyframes for entry in part.entries]
+
+    def keyframe(self, position: int) -> tuple[str, int, tuple[Detection, ...]]:
+        return *self._names[position], ()
+
+
+class FixedRun(UnmatchedRun):
+    """The methods that give one pose to whatever is asked."""
+
+    def __init__(self, method: Method, task: Task) -> None:
+        super().__init__(method, (), task)
+        self._pose = fixed_pose(method, self.poses)
 
     def localize(
         self, frame: Frame, described: Described, recording: str = ""
@@ -236,13 +247,11 @@ class FixedRun(Run):
         return always(self._pose, FIXED, "the same for every query", 0.0), {"describe": 0.0, "localize": 0.0}
 
 
-class NetworkRun(Run):
-    """The methods that regress a pose. `retrieves` is false: no keyframe is looked for."""
+class NetworkRun(UnmatchedRun):
+    """The methods that regress a pose."""
 
-    retrieves = False
-
-    def __init__(self, method: Method, network: TrainedNetwork, poses: FloatArray) -> None:
-        super().__init__(method, network.models, poses)
+    def __init__(self, method: Method, network: TrainedNetwork, task: Task) -> None:
+        super().__init__(method, network.models, task)
         self._network = network
         self.training_frames = network.frames
 
@@ -268,11 +277,11 @@ def open_run(
 ) -> Run:
     """The method on the keyframes of `task`, which go into `store` unless another method brought them there."""
     if method.name in TRIVIAL:
-        return FixedRun(method, keyframe_poses(task))
+        return FixedRun(method, task)
     if method.network is not None:
         own = describers.encoder, describers.settings
         network = trained_network(method, task, training or PoseTraining(), *own, progress)
-        return NetworkRun(method, network, keyframe_poses(task))
+        return NetworkRun(method, network, task)
     if method.name in (SIFT_REFERENCE, COLMAP):
         frames = [name_and_frame[:2] for name_and_frame in read_frames(task.keyframes)]
         if not frames:

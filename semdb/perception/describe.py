@@ -10,6 +10,7 @@ from typing import TypeVar
 import cv2
 
 from semdb.errors import FrameError
+from semdb.perception.box_masks import filled
 from semdb.perception.detections import DetectionRules, Region, rules_of
 from semdb.perception.detectors import load_detector
 from semdb.perception.encoders import load_encoder
@@ -114,7 +115,13 @@ class Describer:
         return [self._finish(*each, shares) for each in zip(views, found, vectors, stretches, strict=True)]
 
     def _detect(self, views: Sequence[View]) -> list[tuple[Detection, ...]]:
-        """What the detector finds, before the rules."""
+        """What the detector finds, before the rules; boxes of detectors without masks are filled."""
+        found = self._found(views)
+        if not getattr(self.detector, "boxes_only", False):
+            return found
+        return [filled(own, view.depth, view.image.shape[:2]) for own, view in zip(found, views, strict=True)]
+
+    def _found(self, views: Sequence[View]) -> list[tuple[Detection, ...]]:
         if isinstance(self.detector, BatchDetector):
             return self.detector.detect_batch([view.image for view in views])
         return [self.detector.detect(view.image, view.instances) for view in views]

@@ -21,6 +21,7 @@ from semdb.recordings.synthetic import SyntheticOptions, write_synthetic_recordi
 from tests.rooms import SMALL, semdb
 from tests.unit.onnx_files import write_constant_model
 from tests.unit.recording_miniatures import write_seven_scenes
+from tests.unit.test_pose_regression import write_pooled_encoder
 
 URL = "sqlite:///unused.sqlite3"
 FEW = ("--keyframes", 8, "--max-queries", 4)
@@ -186,6 +187,27 @@ def test_the_ablation_has_a_row_for_every_layer(room: Path, tmp_path: Path) -> N
     assert by_name["cnn"]["ranked_share"] == 1.0
     assert set(by_name["cnn"]["stages"]) == {"all"}
     assert set(by_name["hard"]["stages"]) == {"filtered"}  # the hard filter has the last word
+
+
+def test_networks_and_fixed_poses_have_a_table_and_pictures_and_networks_are_kept(room: Path, tmp_path: Path) -> None:
+    encoder = write_pooled_encoder(tmp_path / "encoder.onnx")
+    asked = (room, "--keyframes", 6, "--max-queries", 2, "--encoder", f"onnx:{encoder}", "--pose-steps", 3)
+    methods = ("--method", "posenet", "--method", "posenet-keyframes", "--method", "mean-pose")
+    kept = ("--pose-networks", "networks", "--json", "r.json")
+    evaluate(*asked, *methods, *kept, "--report", "report", cwd=tmp_path)
+    first = read(tmp_path / "r.json")
+    assert [result["method"] for result in first] == ["posenet", "posenet-keyframes", "mean-pose"]
+    assert [result["success_rate"] for result in first] == [1.0, 1.0, 1.0]
+    assert first[1]["training_frames"] == 6 < first[0]["training_frames"]
+    assert first[2]["training_frames"] is None
+    assert first[0]["models"]["encoder"]["name"] == "onnx:encoder.onnx"
+    page = (tmp_path / "report" / "index.html").read_text()
+    assert "Table 4 on the recordings of this run" in page
+    assert (tmp_path / "report" / "training-1.png").is_file()
+    assert len(list((tmp_path / "networks").glob("*.pth"))) == 2
+    evaluate(*asked, *methods, *kept, cwd=tmp_path)  # found again, not trained
+    again = read(tmp_path / "r.json")
+    assert [result["mean_translation_m"] for result in again] == [result["mean_translation_m"] for result in first]
 
 
 def test_colmap_and_both_truths(room: Path, tmp_path: Path) -> None:

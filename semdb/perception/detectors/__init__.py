@@ -10,6 +10,9 @@ from semdb.settings import Settings
 def load_detector(spec: str, settings: Settings) -> Detector:
     """The detector of a `spec`: ``onnx:FILE``, ``torchvision:NAME``, ``torchvision:PATH`` or ``recorded``.
 
+    Of boxes only are ``fasterrcnn:PATH`` and ``ssd:PATH``, and ``boxes:SPEC`` and ``whole-boxes:SPEC``, which are
+    another one without its masks.
+
     The network runs on ``settings.device``, on the CPU with ``settings.threads`` threads.
     Raises UsageError for a spec that is none, ModelError when its file is missing or is no Mask R-CNN.
     """
@@ -25,7 +28,16 @@ def load_detector(spec: str, settings: Settings) -> Detector:
         from semdb.perception.detectors.torchvision import TorchvisionDetector
 
         return TorchvisionDetector(spec, settings)
+    if spec.startswith(("boxes:", "whole-boxes:")):
+        from semdb.perception.detectors.boxes import BoxesOf
+
+        kind, _, other = spec.partition(":")
+        return BoxesOf(load_detector(other, settings), by_depth=kind == "boxes")
+    if spec.startswith(("fasterrcnn:", "ssd:")):
+        from semdb.perception.detectors.boxes import BoxDetector
+
+        return BoxDetector(spec, settings)
     raise UsageError(
         f"no detector {spec!r}: write onnx:FILE (a Mask R-CNN), torchvision:maskrcnn_resnet50_fpn_v2 (or the path of a "
-        "checkpoint) or recorded (masks of the recording)"
+        "checkpoint), fasterrcnn:FILE or ssd:FILE (boxes only) or recorded (masks of the recording)"
     )
