@@ -113,7 +113,7 @@ class Settings(BaseSettings):
     descriptor_dtype: Literal["auto", "float32", "float16", "uint8"] = Field(
         "auto",
         description="how descriptors of float are stored: float32, float16 (half the room), uint8 (a quarter). auto: "
-        "as the map has them, uint8 in a new one",
+        "as the map has them, float32 in a new one",
     )
     keep_images: Literal["original", "jpeg", "none"] = Field(
         "original",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any, NoReturn
@@ -58,7 +58,7 @@ class _Target:
     map_id: int
     map_name: str
     model_ids: Mapping[ModelInfo, int]
-    descriptor_dtype: str  # of its last keyframe, "uint8" where it has none
+    descriptor_dtype: str  # of its last keyframe, "float32" where it has none
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +135,7 @@ class KeyframeWriter:
                 change = update(tables.recordings).where(tables.recordings.c.id == recording_id)
                 connection.execute(change.values(state=RecordingState.INGESTING.value))
             models = map_model_ids(connection, row.id)
-            return _Target(row.id, row.name, models, _dtype_of(connection, row.id, models))
+            return _Target(row.id, row.name, models, _dtype_of(connection, row.id))
 
         target = retry.write(self._engine, work)
         self._targets[recording_id] = target
@@ -206,18 +206,15 @@ def _check_description(description: Description) -> None:
         raise UsageError("the CNN vector of a description is one finite row")
 
 
-def _dtype_of(connection: Connection, map_id: int, models: Collection[ModelInfo]) -> str:
-    """How descriptors of float are stored in a map: as in its last keyframe, as bytes in a new map.
-
-    Those of networks stay whole: what bytes cost them is not known.
-    """
+def _dtype_of(connection: Connection, map_id: int) -> str:
+    """How descriptors of float are stored in a map: as in its last keyframe, whole in a new map."""
     k, r, d = tables.keyframes.c, tables.recordings.c, tables.descriptors.c
     query = select(func.substr(d.data, 1, HEAD)).join(tables.keyframes, k.id == d.keyframe_id)
     query = query.join(tables.recordings, r.id == k.recording_id).where(r.map_id == map_id)
     head = connection.execute(query.order_by(k.id.desc()).limit(1)).scalar()
     if head is not None:
         return dtype_of(bytes(head))
-    return "float32" if any(one.role == "features" and one.name.startswith("onnx:") for one in models) else "uint8"
+    return "float32"
 
 
 def _image_row(record: KeyframeRecord) -> dict[str, Any]:

@@ -50,10 +50,10 @@ def test_small_rows_hold_the_same_in_half_the_room(room: Path, database_url: str
 
 
 def test_rows_of_bytes_hold_the_same_on_every_server(room: Path, database_url: str, tmp_path: Path) -> None:
-    """A new map has them without a setting; a map of others keeps to its own."""
+    """A map keeps to its own without a setting."""
     here = f"sqlite:///{tmp_path / 'here.sqlite3'}"
     for url in (here, database_url):
-        ingest_recordings([room], settings(url, "auto"), IngestOptions(keyframes=3, map_name="m"))
+        ingest_recordings([room], settings(url, "uint8"), IngestOptions(keyframes=3, map_name="m"))
     whole = f"sqlite:///{tmp_path / 'whole.sqlite3'}"
     ingest_recordings([room], settings(whole, "float32"), IngestOptions(keyframes=3, map_name="m"))
     with open_store(whole) as large, open_store(here) as first, open_store(database_url) as second:
@@ -72,10 +72,13 @@ def test_rows_of_bytes_hold_the_same_on_every_server(room: Path, database_url: s
             assert kept.keypoints.features.descriptors.dtype == np.int8
             back = from_bytes(kept.keypoints.features.descriptors)
             assert np.abs(back - exact.keypoints.features.descriptors).max() <= 0.5 / 172 + 1e-6
-    ingest_recordings([room], settings(whole, "auto"), IngestOptions(keyframes=4, map_name="m", name="more"))
-    with open_store(whole) as store:
-        kinds = {k.keypoints.features.descriptors.dtype.name for k in store.load_keyframes(store.keyframe_ids(1))}
-        assert kinds == {"float32"}
+    for url, kind in ((whole, "float32"), (here, "int8")):
+        ingest_recordings([room], settings(url, "auto"), IngestOptions(keyframes=4, map_name="m", name="more"))
+        ingest_recordings([room], settings(url, "auto"), IngestOptions(keyframes=2, map_name="new"))
+        with open_store(url) as store:
+            for map_id, expected in ((1, kind), (2, "float32")):
+                known = store.load_keyframes(store.keyframe_ids(map_id))
+                assert {k.keypoints.features.descriptors.dtype.name for k in known} == {expected}
 
 
 def test_a_map_of_both_kinds_answers_as_one(room: Path, tmp_path: Path) -> None:

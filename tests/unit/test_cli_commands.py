@@ -250,9 +250,15 @@ def test_every_listed_spec_is_known_to_its_loader() -> None:
     from semdb.perception.detectors import load_detector
     from semdb.perception.encoders import load_encoder
     from semdb.perception.features import load_features
+    from semdb.perception.matchers import load_matcher
     from semdb.settings import Settings
 
-    loaders: dict[str, Any] = {"detector": load_detector, "encoder": load_encoder, "features": load_features}
+    loaders: dict[str, Any] = {
+        "detector": load_detector,
+        "encoder": load_encoder,
+        "features": load_features,
+        "matcher": load_matcher,
+    }
     for role, spec, needs_file, _ in SPECS:
         if needs_file:
             with pytest.raises(ModelError, match="no model file at"):
