@@ -13,9 +13,10 @@ from typing import Any
 
 from sqlalchemy import Connection, Engine, Table, insert, select
 
-from semdb.database import retry, tables
+from semdb.database import checked, retry, tables
 from semdb.database.copying_landmarks import copy_landmarks
 from semdb.database.ids import new_id
+from semdb.database.links import LARGEST_ID
 from semdb.database.records import ChangeKind
 from semdb.database.refinements import map_state
 from semdb.database.statement import HIDDEN
@@ -249,7 +250,10 @@ def _copy_links(copy: _Copy, map_id: int) -> None:
 
     def work(connection: Connection) -> None:
         for row in rows:
-            first, second = new.get(int(row["keyframe_id"])), new.get(int(row["other_keyframe_id"]))
+            first, second = (
+                new.get(checked.integer(row[name], f"loop_closures.{name}", 1, LARGEST_ID))
+                for name in ("keyframe_id", "other_keyframe_id")
+            )
             same = [c.keyframe_id == first, c.other_keyframe_id == second, c.kind == row["kind"]]
             if first is None or second is None or connection.execute(select(c.kind).where(*same)).first() is not None:
                 continue

@@ -133,13 +133,13 @@ def page_of_links(
         except CodecError as error:
             if bad is None:
                 raise
-            bad(int(row.keyframe_id), error)
+            bad(row.keyframe_id if isinstance(row.keyframe_id, int) else 0, error)
     last = rows[-1] if rows and len(rows) == limit else None
     return found, None if last is None else (last.keyframe_id, last.other_keyframe_id, last.kind)
 
 
 def _link(row: Any) -> Link:
-    where = f"of the link of keyframes {row.keyframe_id} and {row.other_keyframe_id}"
+    where = f"of the link of keyframes {checked.shown(row.keyframe_id)} and {checked.shown(row.other_keyframe_id)}"
     return Link(
         first=checked.integer(row.keyframe_id, f"loop_closures.keyframe_id {where}", 1, LARGEST_ID),
         second=checked.integer(row.other_keyframe_id, f"loop_closures.other_keyframe_id {where}", 1, LARGEST_ID),
@@ -182,5 +182,5 @@ def load_covariances(engine: Engine, keyframe_ids: Sequence[int], bad: Bad | Non
             except CodecError as error:
                 if bad is None:
                     raise
-                bad(int(row.keyframe_id), error)
+                bad(row.keyframe_id if isinstance(row.keyframe_id, int) else 0, error)
     return found
