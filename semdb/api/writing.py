@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from semdb.api.reading import Reading
 from semdb.database.records import Deleted, RecordingStatus
-from semdb.errors import DatabaseUnavailableError, SemdbError, UsageError
+from semdb.errors import CodecError, DatabaseUnavailableError, FrameError, SemdbError, UsageError
 from semdb.names import storable
 
 if TYPE_CHECKING:  # the rooms behind are entered when something is asked of them: they take a second to import
@@ -335,7 +335,10 @@ class Writing(Reading):
         store = self._store()
 
         def kept(rgb: bytes, depth: bytes | None, name: str) -> tuple[bytes, bytes | None]:
-            return kept_images(rgb, depth, keep_images, name)
+            try:
+                return kept_images(rgb, depth, keep_images, name)
+            except FrameError as error:  # its keyframe stays, as one with a damaged blob
+                raise CodecError(str(error)) from error
 
         return compact_map(
             store.engine, store.find_map(map).id, dtype, None if keep_images == ORIGINAL else kept,

@@ -208,11 +208,16 @@ def encode_descriptors(descriptors: npt.NDArray[np.generic], dtype: str = "float
 
 
 def dtype_of(head: bytes) -> str:
-    """``float32``, ``float16`` or ``uint8``, by the first `HEAD` bytes of descriptors; ``uint8`` of what is none."""
-    if len(head) < _HEADER.size or head[:4] != ARRAY_MAGIC:
+    """How descriptors of float are stored, by the first `HEAD` bytes of a blob: ``float32``, ``float16`` or ``uint8``.
+
+    ``float32``, so that nothing is rounded, where the blob does not say it: its descriptors are of bits, or it is none.
+    """
+    if len(head) < _HEADER.size:
+        return "float32"
+    if head[:4] == BYTES_MAGIC:
         return "uint8"
-    dtype = _DTYPES.get(_HEADER.unpack_from(head)[2])
-    return "uint8" if dtype is None else dtype.name
+    half = head[:4] == ARRAY_MAGIC and _DTYPES.get(_HEADER.unpack_from(head)[2]) == np.float16
+    return "float16" if half else "float32"
 
 
 def decode_descriptors(blob: bytes, where: str) -> npt.NDArray[np.generic]:

@@ -156,7 +156,8 @@ class FrameReader:
         if not names:
             raise RecordingError("no frame that a network could be trained on can be read")
         known = [pose for pose in poses if pose is not None]
-        return PoseData(np.stack(rows), np.array(windows, dtype=np.int32), np.stack(known), tuple(names))
+        encoder = "" if self.inputs.model is None else self.inputs.model.sha256
+        return PoseData(np.stack(rows), np.array(windows, dtype=np.int32), np.stack(known), tuple(names), encoder)
 
 
 def network_file(folder: Path, task: Task, method: Method) -> Path:
@@ -189,12 +190,16 @@ def trained_network(
 
     With `must_train` one that is there already is an error, or is gone on from with `resume`.
     """
-    from semdb.training.pose import load, train
+    from semdb.training.pose import check_checkpoint, load, train
     from semdb.training.pose_inputs import make_inputs
 
     if method.network is None:
         raise UsageError(f"--method {method.name} is no network")
     options = replace(training.options, kind=method.network)
+    path = None if training.networks is None else network_file(training.networks, task, method)
+    found = path is not None and path.exists() and not must_train
+    if not found:
+        check_checkpoint(path, resume=resume)  # before minutes of reading
     reader = FrameReader(task.recordings, make_inputs(options, encoder, settings, say), options)
 
     def tell(what: str, done: int, total: int) -> None:
@@ -203,8 +208,7 @@ def trained_network(
 
     parts = training_parts(task, keyframes_only=method.keyframes_only)
     data = reader.data(parts, lambda done, total: tell("images to learn from", done, total))
-    path = None if training.networks is None else network_file(training.networks, task, method)
-    if path is not None and path.exists() and not must_train:
+    if path is not None and found:
         regressor = load(path, data, options, settings)
     else:
         regressor = train(

@@ -23,6 +23,7 @@ from semdb.localization.verdict import Judgement, VerdictOptions
 from semdb.localization.views import ClassNumbers, KeyframeView, View, make_view
 from semdb.perception.keypoints import find_keypoints
 from semdb.perception.protocols import FeatureExtractor
+from semdb.perception.quality import stretch_of, stretched
 from semdb.types import Description, Float32Array, FloatArray, ImageArray, Tolerance, Verdict
 
 CAPACITY = 128  # keyframes; about 0.6 MiB each
@@ -78,7 +79,9 @@ def fallback_cache(store: Store, fallback: Fallback, numbers: ClassNumbers) -> S
     def made(stored: StoredKeyframe, depth: Float32Array, grey: ImageArray) -> View | None:
         categories = [found.category for found in stored.objects]
         objects = list(zip(categories, store.load_masks(stored.id), strict=True))
-        keypoints = find_keypoints(fallback.extractor, stored.camera, grey, depth, objects, fallback.dynamic)
+        stretch = stretch_of(grey)  # as the query is, where it has little contrast
+        seen = grey if stretch is None else stretched(grey, stretch)
+        keypoints = find_keypoints(fallback.extractor, stored.camera, seen, depth, objects, fallback.dynamic)
         return make_view(stored.camera, keypoints, categories, numbers, with_points_only=True, grey=grey)
 
     return ShapeCache(store, made, placed_view, CAPACITY)

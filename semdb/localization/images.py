@@ -100,9 +100,15 @@ def fallback_of(settings: Settings, models: Sequence[ModelInfo]) -> Fallback | N
     from semdb.perception.matchers import load_matcher
 
     extractor = load_features(settings.features_fallback, settings)
+    learned = is_learned([extractor.info])
+    if settings.matcher is not None and not (learned or is_learned(models)):
+        raise UsageError(
+            f"SEMDB_MATCHER={settings.matcher} matches learned features, and SEMDB_FEATURES_FALLBACK is "
+            f"{settings.features_fallback}: unset it, or name a fallback onnx:FILE"
+        )
     if extractor.info in models:
         return None
-    matcher = None if settings.matcher is None else load_matcher(settings.matcher, settings)
+    matcher = load_matcher(settings.matcher, settings) if settings.matcher is not None and learned else None
     return Fallback(extractor, matcher, dynamic_classes(models))
 
 

@@ -65,8 +65,10 @@ class OnnxMatcher:
                 f"{self.path} is no matcher: wanted are float inputs {', '.join(_INPUTS)} and outputs "
                 f"{', '.join(_OUTPUTS)}, but it has {found} and {', '.join(outputs)}"
             )
-        width = next(i.shape for i in inputs if i.name == "descriptors0")[-1]
-        self.width = width if isinstance(width, int) else None  # of descriptors, where the file says it
+        shape = next(i.shape for i in inputs if i.name == "descriptors0")
+        self.width = (
+            shape[-1] if shape and isinstance(shape[-1], int) else None
+        )  # of descriptors, where the file says it
 
     def match(
         self,
@@ -105,9 +107,11 @@ class OnnxMatcher:
             )
 
     def _pairs(self, found: Any, count: int, other: int) -> tuple[IntArray, IntArray]:
-        if found.shape != (count,) or found.max(initial=-1) >= other:
+        if found.shape != (count,) or found.dtype.kind != "i" or found.max(initial=-1) >= other:
+            most = found.max(initial=-1) if found.dtype.kind == "i" else found.dtype
             raise ModelError(
-                f"{self.path} gave matches {found.shape} up to {found.max()} for {count} and {other} keypoints"
+                f"{self.path} gave matches {found.shape} up to {most} for {count} and {other} keypoints; wanted is an "
+                f"integer for each keypoint of the first image, -1 or one of the second: is it a matcher?"
             )
         one = np.flatnonzero(found >= 0)
         two = found[one]

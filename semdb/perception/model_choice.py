@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from semdb.errors import ModelError, UsageError
@@ -144,6 +144,8 @@ _RIGHT: dict[str, Callable[[object], bool]] = {
 def _spec_of(model: ModelInfo, settings: Settings) -> str:
     """The spec that loads `model` here; files are looked for where bare names are."""
     kind, _, name = model.name.partition(":")
+    if kind in ("boxes", "whole-boxes"):
+        return f"{kind}:{_spec_of(replace(model, name=name), settings)}"
     if kind not in ("onnx", "torchvision"):
         return model.name
     find = resolve_onnx if kind == "onnx" else resolve_checkpoint

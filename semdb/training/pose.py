@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semdb.errors import ModelError, TrainingError, UsageError
-from semdb.perception.torch_models import choose_device, import_torch, read_checkpoint
+from semdb.perception.torch_models import choose_device, import_torch, load_weights, read_checkpoint, state_dict_of
 from semdb.settings import Settings
 from semdb.shown import number
 from semdb.training.pose_network import as_floats, build, filtered, loss_of, single
@@ -35,12 +35,14 @@ class PoseData:
 
     `inputs` ``[n, C, h, w]`` of all frames that are looked at. `windows` ``[m, W]`` are positions in `inputs`, of the
     frame that has the pose and, before it, of those that a filter sees too; `poses` ``[m, 4, 4]``, `names` ``[m]``.
+    `encoder` is the SHA-256 of the network whose maps `inputs` are, "" where they are pixels.
     """
 
     inputs: npt.NDArray[Any]
     windows: IntArray
     poses: FloatArray
     names: tuple[str, ...]
+    encoder: str = ""
 
     def digest(self) -> str:
         """Of which frames these are, and of their poses."""
@@ -82,14 +84,11 @@ def train(
     """Trains on `data`; `checkpoint` is written at the end, and where `stop_after` steps end the run.
 
     `resume` goes on from `checkpoint`, to the same weights as a run that was never cut off. Raises TrainingError for a
-    loss that is not finite and a checkpoint of other frames or options, UsageError for a checkpoint that is there
-    already, or not there to go on from, ModelError without torch.
+    loss that is not finite and a checkpoint of other frames, options or encoder, or a damaged one; UsageError for one
+    that is there already, or not there to go on from, or cannot be written; ModelError without torch.
     """
     torch = import_torch()
-    if checkpoint is not None and checkpoint.exists() and not resume:
-        raise UsageError(f"{checkpoint} is there already: go on with --resume, or give another --output")
-    if resume and (checkpoint is None or not checkpoint.exists()):
-        raise UsageError(f"{checkpoint} is not there, so there is nothing to go on from: leave out --resume to begin")
+    check_checkpoint(checkpoint, resume=resume)
     torch.set_num_threads(settings.threads)
     device = choose_device(settings.device, torch)
     with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
@@ -106,6 +105,19 @@ def train(
     return PoseRegressor(run.network, options, run.scale, device, run.losses)
 
 
+def check_checkpoint(path: Path | None, *, resume: bool) -> None:
+    """Makes the folder of a checkpoint. Raises UsageError where a run could not begin with it, go on or write it."""
+    if path is not None and path.exists() and not resume:
+        raise UsageError(f"{path} is there already: go on with --resume, or give another --output")
+    if resume and (path is None or not path.exists()):
+        raise UsageError(f"{path} is not there, so there is nothing to go on from: leave out --resume to begin")
+    if path is not None:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UsageError(f"{path} cannot be written: {error.strerror}: give another --output") from error
+
+
 def load(path: Path, data: PoseData, options: PoseOptions, settings: Settings) -> PoseRegressor:
     """The network of a finished checkpoint, with the options that it was trained with.
 
@@ -117,15 +129,14 @@ def load(path: Path, data: PoseData, options: PoseOptions, settings: Settings) -
     own = _options(content, path)
     if own.kind != options.kind or own.backbone != options.backbone:
         raise TrainingError(f"{path} is {own.kind} on {own.backbone}, not {options.kind} on {options.backbone}")
-    if content["step"] < own.total_steps:
-        raise TrainingError(
-            f"{path} has {content['step']} of {own.total_steps} steps: go on with semdb train pose --resume"
-        )
+    step = _step(content, path)
+    if step < own.total_steps:
+        raise TrainingError(f"{path} has {step} of {own.total_steps} steps: go on with semdb train pose --resume")
     device = choose_device(settings.device, torch)
     with torch.random.fork_rng(devices=[]):
         run = _Run(own, data, device)
-    run.network.load_state_dict(content["model"])
-    return PoseRegressor(run.network, own, run.scale, device, list(content["losses"]))
+    run.weights(content, path)
+    return PoseRegressor(run.network, own, run.scale, device, run.losses)
 
 
 class _Run:
@@ -209,28 +220,40 @@ class _Run:
             "format": FORMAT,
             "options": _plain(self.options),
             "frames": self.data.digest(),
+            "encoder": self.data.encoder,
             "model": self.network.state_dict(),
             "optimizer": None if self._optimizer is None else self._optimizer.state_dict(),
             "step": self.step,
             "losses": self.losses,
         }
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
             new = path.with_name(path.name + ".new")
-            self.torch.save(content, new)
+            with new.open("wb") as file:  # of a path torch says RuntimeError where it cannot be written
+                self.torch.save(content, file)
             new.replace(path)
         except OSError as error:
             raise UsageError(f"{path} cannot be written: {error.strerror}") from error
 
     def restore(self, path: Path) -> None:
         content = _checked(path, self.data)
-        if content["options"] != _plain(self.options):
+        if content.get("options") != _plain(self.options):
             raise TrainingError(f"{path} was made with other options: resume with the same ones")
-        self.network.load_state_dict(content["model"])
-        self.step, self.losses = int(content["step"]), list(content["losses"])
+        self.step = _step(content, path)
+        self.weights(content, path)
         if 0 < self.step < self.options.total_steps and self.step != self.options.steps:
             self._begin(self.step >= self.options.steps)
-            self._optimizer.load_state_dict(content["optimizer"])
+            try:
+                self._optimizer.load_state_dict(content["optimizer"])
+            except (AttributeError, KeyError, TypeError, ValueError) as error:  # torch's, for what is no state
+                raise _damaged(path) from error
+
+    def weights(self, content: dict[str, Any], path: Path) -> None:
+        """Takes the weights and losses of a checkpoint. Raises TrainingError, ModelError where they do not fit."""
+        load_weights(self.network, state_dict_of(content, path), path, f"{self.options.kind} on these inputs")
+        losses = content.get("losses")
+        if not isinstance(losses, list) or not all(isinstance(loss, float) for loss in losses):
+            raise _damaged(path)
+        self.losses = list(losses)
 
 
 def rate_at(options: PoseOptions, step: int) -> float:
@@ -244,12 +267,28 @@ def _checked(path: Path, data: PoseData) -> dict[str, Any]:
     content = read_checkpoint(path)
     if content.get("format") != FORMAT:
         raise TrainingError(f"{path} is no checkpoint of semdb train pose")
-    if content["frames"] != data.digest():
+    if content.get("encoder", "") != data.encoder:
+        raise TrainingError(
+            f"{path} was trained on maps of another encoder: set SEMDB_ENCODER to the one that it was trained with, or "
+            "train it anew"
+        )
+    if content.get("frames") != data.digest():
         raise TrainingError(
             f"{path} was trained on other frames than these keyframes and queries leave: give the same --keyframes and "
             "--max-queries, or train it anew"
         )
     return content
+
+
+def _step(content: dict[str, Any], path: Path) -> int:
+    step = content.get("step")
+    if not isinstance(step, int) or step < 0:
+        raise _damaged(path)
+    return step
+
+
+def _damaged(path: Path) -> TrainingError:
+    return TrainingError(f"{path} is a damaged checkpoint of semdb train pose: delete it, and train it anew")
 
 
 def _plain(options: PoseOptions) -> dict[str, Any]:
@@ -260,5 +299,5 @@ def _plain(options: PoseOptions) -> dict[str, Any]:
 def _options(content: dict[str, Any], path: Path) -> PoseOptions:
     try:
         return PoseOptions(**(content["options"] | {"weights": None}))
-    except (TypeError, KeyError) as error:
-        raise TrainingError(f"{path} is a damaged checkpoint of semdb train pose") from error
+    except (TypeError, KeyError, UsageError) as error:
+        raise _damaged(path) from error

@@ -147,6 +147,16 @@ def test_what_is_damaged_stays_and_is_told(url: str) -> None:
         assert (told, done.rewritten) == ([2], KEYFRAMES - 2)  # the first was done before
 
 
+def test_an_image_that_cannot_be_read_stays_and_is_told(url: str) -> None:
+    with open_store(url) as store, store.engine.begin() as connection:
+        of_two = tables.keyframe_images.c.keyframe_id == 2
+        connection.execute(update(tables.keyframe_images).where(of_two).values(rgb=b"\x89PNG\r\n\x1a\n"))
+    code, out, err = run(url, "--images", "jpeg", "--yes")
+    assert code == 0
+    assert f"{KEYFRAMES - 1} of {KEYFRAMES - 1} keyframes rewritten" in out
+    assert "keyframe 2" in err
+
+
 def test_the_command_says_what_is_saved(url: str) -> None:
     code, out, _ = run(url, "--dry-run")
     assert code == 0

@@ -112,6 +112,8 @@ def test_a_blob_of_bytes_says_what_it_is() -> None:
     assert codecs.dtype_of(codecs.encode_descriptors(vectors(1), "float16")[: codecs.HEAD]) == "float16"
     bits = np.arange(64, dtype=np.uint8).reshape(2, 32)
     np.testing.assert_array_equal(codecs.decode_descriptors(codecs.encode_descriptors(bits, "uint8"), "here"), bits)
+    of_bits = codecs.encode_descriptors(bits, "auto")[: codecs.HEAD]  # keypoints beside them stay whole
+    assert [codecs.dtype_of(head) for head in (of_bits, b"", b"x" * codecs.HEAD)] == ["float32"] * 3
     wide = vectors(2, 300)  # stays as it is
     np.testing.assert_array_equal(codecs.decode_descriptors(codecs.encode_descriptors(wide, "uint8"), "here"), wide)
 

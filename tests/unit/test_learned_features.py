@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from semdb.errors import ModelError, UsageError
+from semdb.localization.images import fallback_of
 from semdb.localization.learned_matching import for_learned, is_learned, match_by
 from semdb.localization.localizer import LocalizerOptions
 from semdb.localization.matching import Evidence, MatchingOptions, match_keypoints
 from semdb.localization.views import ClassNumbers, View, make_view
 from semdb.perception.features import load_features
-from semdb.perception.matchers import load_matcher
+from semdb.perception.matchers import OnnxMatcher, load_matcher
 from semdb.settings import Settings
 from semdb.types import Camera, Features, Keypoints, ModelInfo
 from tests.unit.onnx_files import write_constant_model
@@ -73,6 +74,7 @@ def test_an_image_without_pixels_has_no_keypoints(tmp_path: Path) -> None:
         ({"descriptors": np.zeros((3,), np.float32)}, r"gave descriptors \(3,\)"),
         ({"descriptors": np.full((3, 4), np.nan, np.float32)}, "not finite"),
         ({"scores": np.full(3, np.inf, np.float32)}, "not finite"),
+        ({"keypoints": np.array(1, np.float32)}, r"gave keypoints \(\), scores \(3,\)"),
     ],
 )
 def test_a_network_that_gives_nonsense_is_an_error(
@@ -92,6 +94,32 @@ def test_another_network_is_no_feature(tmp_path: Path) -> None:
         load_matcher(f"onnx:{path}", SETTINGS)
     with pytest.raises(UsageError, match="SEMDB_MATCHER is onnx:FILE"):
         load_matcher("lighterglue", SETTINGS)
+
+
+@pytest.mark.parametrize(
+    "found", [np.zeros(0, np.int64), np.zeros((2, 2), np.int64), np.array([0, 3]), np.array([0.0, 1.0])]
+)
+def test_matches_that_are_none_are_an_error(tmp_path: Path, found: np.ndarray) -> None:
+    matcher = OnnxMatcher.__new__(OnnxMatcher)
+    matcher.path = tmp_path / "matcher.onnx"
+    with pytest.raises(ModelError, match=r"matcher.onnx gave matches \(.*for 2 and 3 keypoints; wanted is an integer"):
+        matcher._pairs(found, 2, 3)
+    one, two = matcher._pairs(np.array([2, -1]), 2, 3)
+    assert (one.tolist(), two.tolist()) == ([0], [2])
+
+
+def test_a_matcher_goes_with_what_it_can_match(tmp_path: Path) -> None:
+    surf, learned = ModelInfo("features", "surf", ""), ModelInfo("features", "onnx:x.onnx", "0")
+    own = replace_settings(features_fallback="sift", matcher="onnx:matcher.onnx")
+    with pytest.raises(UsageError, match="matches learned features, and SEMDB_FEATURES_FALLBACK is sift"):
+        fallback_of(own, [surf])
+    found = fallback_of(own, [learned])  # of which the matcher is
+    assert found is not None
+    assert (found.name, found.matcher) == ("sift", None)
+
+
+def replace_settings(**changed: str) -> Settings:
+    return SETTINGS.model_copy(update=changed)
 
 
 def test_thresholds_follow_the_feature() -> None:

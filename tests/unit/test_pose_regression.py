@@ -103,9 +103,24 @@ def test_checkpoints_of_something_else_are_refused(tmp_path: Path) -> None:
         load(path, data, replace(SMALL, kind="cnn-lstm"), SETTINGS)
     with pytest.raises(UsageError, match="nothing to go on from"):
         train(SMALL, data, SETTINGS, checkpoint=tmp_path / "none.pth", resume=True)
+    with pytest.raises(TrainingError, match="maps of another encoder"):
+        load(path, replace(data, encoder="0" * 64), SMALL, SETTINGS)
+    content = torch.load(path, weights_only=True)
+    narrow = replace(data, inputs=data.inputs[:, :6])
+    with pytest.raises(
+        ModelError, match=r"no checkpoint of posenet on these inputs: trunk.0.weight is \[32, 12, 1, 1\]"
+    ):
+        load(path, narrow, SMALL, SETTINGS)
+    for broken in ({"step": None}, {"losses": None}, {"options": 3}, {"options": {"kind": []}}):
+        torch.save(content | broken, path)
+        with pytest.raises(TrainingError, match="is a damaged checkpoint"):
+            load(path, data, SMALL, SETTINGS)
     torch.save({"weights": torch.ones(1)}, path)
     with pytest.raises(TrainingError, match="no checkpoint of semdb train pose"):
         load(path, data, SMALL, SETTINGS)
+    (tmp_path / "file").touch()
+    with pytest.raises(UsageError, match=r"file/net.pth cannot be written"):
+        train(SMALL, data, SETTINGS, checkpoint=tmp_path / "file" / "net.pth")
 
 
 def test_the_first_convolution_is_widened_by_the_mean_of_its_colours(tmp_path: Path) -> None:

@@ -56,7 +56,7 @@ class OnnxFeatures:
 
     def _check(self, xy: npt.NDArray[Any], scores: npt.NDArray[Any], descriptors: npt.NDArray[Any]) -> None:
         """Raises ModelError unless the outputs are what they should be."""
-        count = len(xy)
+        count = len(xy) if xy.ndim else 0
         if xy.shape != (count, 2) or scores.shape != (count,) or descriptors.shape[:1] != (count,):
             shapes = f"keypoints {xy.shape}, scores {scores.shape}, descriptors {descriptors.shape}"
             raise ModelError(f"{self._model.path} gave {shapes}; wanted are [N, 2], [N] and [N, d]")
