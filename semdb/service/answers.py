@@ -36,7 +36,12 @@ def tagged(
 ) -> Response:
     """`content` with its ETag, or 304 where the client has it. `for_ever`: it never changes under its address."""
     tag = f'"{hashlib.sha256(content).hexdigest()[:32]}"'
-    all_headers = {"ETag": tag, "Cache-Control": FOR_EVER if for_ever else ASK_AGAIN, **(headers or {})}
+    all_headers = {
+        "ETag": tag,
+        "Cache-Control": FOR_EVER if for_ever else ASK_AGAIN,
+        "Vary": "Authorization",  # what a browser kept for one token is not for whoever comes with another
+        **(headers or {}),
+    }
     known = [one.strip().removeprefix("W/") for one in request.headers.get("if-none-match", "").split(",")]
     if tag in known or "*" in known:
         return Response(None, 304, all_headers)

@@ -83,7 +83,7 @@ class Sessions:
         finally:
             live.waiting -= 1
             live.used_s = time.monotonic()
-            if live.tracker is None and not live.waiting:
+            if live.tracker is None and not live.waiting and self._live.get(name) is live:
                 self.end(name)
 
     def watched(self, map_name: str) -> list[dict[str, Any]]:

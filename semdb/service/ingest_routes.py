@@ -14,7 +14,8 @@ from starlette.responses import Response, StreamingResponse
 
 from semdb.api import Database
 from semdb.database.jobs import DONE, FAILED, PLANNED, Job
-from semdb.errors import NotFoundError, UsageError
+from semdb.database.records import RecordingStatus
+from semdb.errors import NotFoundError, SemdbError, UsageError
 from semdb.recordings.arrays import as_camera
 from semdb.recordings.images import header_of
 from semdb.service import schemas
@@ -120,7 +121,7 @@ async def follow_job(request: Request, job: JobId) -> Response:
                 await asyncio.sleep(EVENT_S)
                 await admit(request, INGEST)
                 shown = await _look(request, job)
-        except Problem:
+        except (Problem, SemdbError):  # nothing can be said any more: whoever follows comes again, and is told
             return
         finally:
             service.streams -= 1
@@ -146,16 +147,19 @@ def job_of(db: Database, job_id: int, access: Access) -> Job:
     return job
 
 
-def items_of(db: Database, job: Job) -> dict[str, int] | None:
-    """Keyframes of a job's recordings by their state."""
+def items_of(db: Database, job: Job, known: dict[str, list[RecordingStatus]] | None = None) -> dict[str, int] | None:
+    """Keyframes of a job's recordings by their state. `known`: recordings of maps that need not be asked for again."""
     names = {str(one["recording"]) for one in job.result}
     if not names:
         return None
     counts: dict[str, int] = {}
-    try:
-        found = [one for one in db.recordings(job.map) if one.name in names]
-    except NotFoundError:
-        return {}
+    known = {} if known is None else known
+    if job.map not in known:
+        try:
+            known[job.map] = db.recordings(job.map)
+        except NotFoundError:
+            known[job.map] = []
+    found = [one for one in known[job.map] if one.name in names]
     for one in found:
         for state, count in one.items.items():
             counts[str(state)] = counts.get(str(state), 0) + count

@@ -10,6 +10,7 @@ from starlette.responses import Response
 
 from semdb.api import Database
 from semdb.database.jobs import DONE, FAILED, PLANNED, Job
+from semdb.database.records import RecordingStatus
 from semdb.errors import SemdbError
 from semdb.recordings.roots import check_root
 from semdb.service import schemas
@@ -41,7 +42,8 @@ async def list_jobs(
     def look(db: Database) -> list[dict[str, Any]]:
         wanted = map if map is not None else access.map
         found = db.jobs(wanted, who=who, before=before, limit=most + 1)
-        return [job_dict(job, items_of(db, job), service.progress_of(job.id)) for job in found]
+        known: dict[str, list[RecordingStatus]] = {}
+        return [job_dict(job, items_of(db, job, known), service.progress_of(job.id)) for job in found]
 
     return page_of(request, await read(request, look), most, lambda one: one["job"], lambda one: one, by="before")
 

@@ -16,7 +16,7 @@ from semdb.service.answers import encoded, tagged
 from semdb.service.problems import Problem, not_found
 from semdb.service.roles import READ
 from semdb.service.routing import KeyframeId, Table
-from semdb.service.state import access_of, read
+from semdb.service.state import access_of, draw, read
 
 table = Table("keyframes")
 MEDIA = {"png": "image/png", "jpeg": "image/jpeg"}
@@ -53,7 +53,7 @@ async def get_image(
     await keyframe_of(request, keyframe)
     stored = await read(request, lambda db: db.keyframe_files(keyframe))
     if width is not None or box is not None:
-        smaller = await read(request, lambda _: part_of(stored.rgb, keyframe, width, box))
+        smaller = await draw(request, lambda _: part_of(stored.rgb, keyframe, width, box))
         return tagged(request, smaller, "image/jpeg", for_ever=True)
     return tagged(request, stored.rgb, MEDIA.get(stored.rgb_format, "application/octet-stream"), for_ever=True)
 
@@ -113,7 +113,7 @@ async def get_mask(request: Request, keyframe: KeyframeId) -> Response:
     """Whose each pixel is, as a PNG: 0 nobody's, else one more than the object's ordinal; the later one covers."""
     found = await keyframe_of(request, keyframe)
 
-    def draw(_: Database) -> bytes:
+    def paint(_: Database) -> bytes:
         size = (found.camera.height, found.camera.width)
         labels = np.zeros(size, np.uint8 if len(found.objects) < 256 else np.uint16)
         for ordinal, thing in enumerate(found.objects):
@@ -122,7 +122,7 @@ async def get_mask(request: Request, keyframe: KeyframeId) -> Response:
                 labels[mask] = ordinal + 1
         return png_of(labels)
 
-    return tagged(request, await read(request, draw), "image/png", for_ever=True)
+    return tagged(request, await draw(request, paint), "image/png", for_ever=True)
 
 
 def part_of(file: bytes, keyframe: int, width: int | None, box: str | None) -> bytes:
@@ -163,7 +163,7 @@ def png_of(labels: Any) -> bytes:
 async def get_picture(request: Request, keyframe: KeyframeId) -> Response:
     """The image with its objects drawn into it."""
     found = await keyframe_of(request, keyframe)
-    drawn = await read(request, lambda _: encode(found.picture(), ".png"))
+    drawn = await draw(request, lambda _: encode(found.picture(), ".png"))
     return tagged(request, drawn, "image/png", for_ever=False)
 
 

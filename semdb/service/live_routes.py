@@ -10,20 +10,20 @@ from typing import Any
 from fastapi import Request
 from starlette.responses import Response, StreamingResponse
 
+from semdb.errors import SemdbError
 from semdb.service import schemas
 from semdb.service.access import admit
 from semdb.service.answers import as_json, encoded
+from semdb.service.ingest_routes import LONGEST_STREAM_S, MOST_STREAMS
 from semdb.service.problems import Problem, busy
 from semdb.service.roles import READ
 from semdb.service.routing import MapName, Table
 from semdb.service.state import Service, read, service_of
 
 table = Table("live")
-MOST_STREAMS = 32
 EVENT_S = 0.25
 STILL_S = 5.0  # without news a line is sent all the same: so long it takes to notice who went away
 ADMIT_S = 5.0
-LONGEST_STREAM_S = 3600.0
 
 
 @table.route("GET", "/v1/maps/{map}/live", READ, schemas.LiveCameras)
@@ -63,7 +63,7 @@ async def _events(request: Request, service: Service, map_name: str) -> AsyncIte
             if now - admitted > ADMIT_S:
                 admitted = now
                 await admit(request, READ)  # a token may have been revoked since
-    except Problem:
+    except (Problem, SemdbError):  # nothing can be said any more: whoever follows comes again, and is told
         return
     finally:
         service.streams -= 1

@@ -15,7 +15,7 @@ from semdb.service.pictures import small
 from semdb.service.problems import Problem, not_found
 from semdb.service.roles import ADMIN, READ
 from semdb.service.routing import AfterId, KeyframeId, Limit, MapName, Table
-from semdb.service.state import access_of, read, service_of
+from semdb.service.state import access_of, draw, read, service_of
 
 table = Table("maps")
 _PICTURE = {"image/jpeg": {"schema": {"type": "string", "format": "binary"}}}
@@ -248,7 +248,7 @@ async def get_map_picture(
         key = db.title_keyframe(map)
         return None if key is None else small(db.keyframe_files(key).rgb, f"keyframe {key}", width)
 
-    found = await read(request, look)
+    found = await draw(request, look)
     if found is None:
         raise not_found(f"picture of the map {map!r}: it has no keyframe")
     return tagged(request, found, "image/jpeg", for_ever=False)

@@ -120,13 +120,18 @@ async def tell(scope: Scope, send: Send, problem: Problem, request_id: str, begu
     body, start = problem.body(request_id), "http.response"
     if scope["type"] == "websocket":
         if "websocket.http.response" not in scope.get("extensions", {}):
-            await send({"type": "websocket.close", "code": 1008, "reason": problem.detail[:100]})
+            await send({"type": "websocket.close", "code": 1008, "reason": close_reason(problem)})
             return
         start = "websocket.http.response"
     headers = [(b"content-type", MEDIA_TYPE.encode()), (b"content-length", str(len(body)).encode())]
     headers += [(name.lower().encode(), value.encode("latin-1", "replace")) for name, value in problem.headers.items()]
     await send({"type": f"{start}.start", "status": problem.status, "headers": headers})
     await send({"type": f"{start}.body", "body": b"" if scope.get("method") == "HEAD" else body})
+
+
+def close_reason(problem: Problem) -> str:
+    """What of a problem fits into the end of a websocket: 123 bytes."""
+    return problem.detail.encode("utf-8", "replace")[:120].decode("utf-8", "ignore")
 
 
 def header(scope: Scope, name: bytes) -> str:
@@ -153,12 +158,20 @@ class Doorkeeper:
         if not self._any_host and _name(host) not in self._hosts:
             raise Problem(403, "the service is not known by the name in the header Host: SEMDB_SERVE_HOSTS names them")
         origin = header(scope, b"origin").lower()
-        if origin and urlsplit(origin).netloc != host:
+        if origin and _netloc(origin) != host:
             raise Problem(403, "requests from pages of other places are refused", kind="foreign-origin")
         site = header(scope, b"sec-fetch-site").lower()
         followed = header(scope, b"sec-fetch-mode").lower() == "navigate" and scope.get("method") in _SAFE
         if site in ("cross-site", "same-site") and not followed:
             raise Problem(403, "requests from pages of other places are refused", kind="foreign-origin")
+
+
+def _netloc(origin: str) -> str | None:
+    """Host and port of an origin; None where it is none."""
+    try:
+        return urlsplit(origin).netloc
+    except ValueError:
+        return None
 
 
 def _name(host: str) -> str:

@@ -16,7 +16,7 @@ from semdb.service.answers import as_json, encoded, tagged
 from semdb.service.keyframe_routes import keyframe_of
 from semdb.service.roles import READ
 from semdb.service.routing import KeyframeId, MapName, Table
-from semdb.service.state import read
+from semdb.service.state import draw, read
 
 table = Table("views")
 MOST_CLOUDS = 4  # that are kept in memory
@@ -28,7 +28,7 @@ _turn = threading.Lock()
 @table.route("GET", "/v1/maps/{map}/scene", READ, schemas.Scene, errors=(304,))
 async def get_scene(request: Request, map: MapName) -> Response:
     """All keyframes, landmarks and accepted links of a map, column by column: what a viewer draws."""
-    found = await read(request, lambda db: encoded(db.scene(map)))
+    found = await draw(request, lambda db: encoded(db.scene(map)))
     return tagged(request, found, "application/json", for_ever=False)
 
 
@@ -43,7 +43,7 @@ async def get_points(
     Little-endian: uint32 number of points, uint32 keyframes that they are of, float32 lowest x, y, z and step x, y, z
     in metres, then uint16 x, y, z of each point in steps above the lowest, then uint8 red, green, blue of each.
     """
-    found = await read(request, lambda db: _points(db, map, count))
+    found = await draw(request, lambda db: _points(db, map, count))
     return tagged(request, found, "application/octet-stream", for_ever=False)
 
 

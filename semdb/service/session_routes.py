@@ -33,7 +33,7 @@ from semdb.service.localize_routes import (
     Timestamp,
     check_pixels,
 )
-from semdb.service.middleware import check_depth, tell
+from semdb.service.middleware import check_depth, close_reason, tell
 from semdb.service.problems import Problem, busy, not_found, problem_of
 from semdb.service.roles import LOCALIZE
 from semdb.service.routing import MapName, Table
@@ -190,7 +190,7 @@ async def stream(socket: WebSocket) -> None:
     except TimeoutError:
         await socket.close(1001, "nothing came for too long")
     except Problem as problem:
-        await socket.close(1008, problem.detail[:100])
+        await socket.close(1008, close_reason(problem))
     finally:
         service.sockets.discard(socket)
 

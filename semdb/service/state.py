@@ -25,6 +25,7 @@ T = TypeVar("T")
 READERS, MOST_READS = 8, 256
 MOST_WRITES = 8
 STATEMENTS, MOST_STATEMENTS = 2, 8
+DRAWERS, MOST_DRAWN = 2, 256  # of pictures and clouds: who asks for many delays nobody's token or list
 _notes: contextvars.ContextVar[list[str] | None] = contextvars.ContextVar("notes", default=None)
 
 
@@ -54,6 +55,7 @@ class Service:
     reading: Pool = field(init=False)
     localizing: Pool = field(init=False)
     statements: Pool = field(init=False)
+    drawing: Pool = field(init=False)
     writing: Pool = field(init=False)
     sessions: Sessions = field(init=False)
     sockets: set[WebSocket] = field(default_factory=set)
@@ -69,6 +71,7 @@ class Service:
         self.reading = Pool("reading", READERS, MOST_READS)
         self.localizing = Pool("localization", self.settings.cores, self.settings.queue)
         self.statements = Pool("statements", STATEMENTS, MOST_STATEMENTS)
+        self.drawing = Pool("pictures", DRAWERS, MOST_DRAWN)
         self.writing = Pool("writing", 1, MOST_WRITES)
         self.rates = Rates(self.settings.rate, self.settings.burst)
         folder = self.settings.uploads or self.database.settings.cache_dir / "serve" / "uploads"
@@ -102,7 +105,7 @@ class Service:
         self.stopping = True
         if self.jobs is not None:
             self.jobs.stop()
-        for pool in (self.localizing, self.statements, self.writing, self.reading):
+        for pool in (self.localizing, self.statements, self.drawing, self.writing, self.reading):
             pool.close()
         self.database.close()
 
@@ -123,6 +126,12 @@ async def read(request: Request, work: Callable[[Database], T]) -> T:
     """The result of a quick look at the database, in a thread."""
     service = service_of(request)
     return await service.reading.run(lambda: work(service.database))
+
+
+async def draw(request: Request, work: Callable[[Database], T]) -> T:
+    """The result of what decodes images, or goes through a whole map, in one of few threads."""
+    service = service_of(request)
+    return await service.drawing.run(lambda: work(service.database))
 
 
 async def gone(request: Request) -> Any:

@@ -1,0 +1,41 @@
+"""What malformed or unusual requests meet before any route."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+
+from semdb.service.cameras import Live, Sessions
+from semdb.service.middleware import Doorkeeper, close_reason
+from semdb.service.problems import Problem
+from semdb.service.settings import ServeSettings
+
+
+@pytest.mark.parametrize("origin", [b"http://[", b"http://[::1", b"null", b"http://elsewhere", b"http://127.0.0.1:1"])
+def test_an_origin_that_is_none_or_another_one_is_refused(origin: bytes) -> None:
+    async def never(*_: Any) -> None:
+        raise AssertionError
+
+    scope = {"type": "http", "method": "GET", "headers": [(b"host", b"127.0.0.1:8765"), (b"origin", origin)]}
+    with pytest.raises(Problem) as refused:
+        asyncio.run(Doorkeeper(never, ServeSettings())(scope, never, never))  # type: ignore[arg-type]
+    assert refused.value.status == 403
+
+
+def test_the_reason_of_an_end_fits_whatever_a_map_is_called() -> None:
+    reason = close_reason(Problem(403, "this token is not for the map " + "\u0645\u0637\u0628\u062e" * 60 + "\udc80"))
+    assert len(reason.encode()) <= 123
+    assert reason.startswith("this token is not for the map ")
+
+
+def test_a_request_that_failed_ends_no_camera_but_its_own() -> None:
+    async def both() -> int:
+        sessions = Sessions(4, 60.0)
+        async with sessions.use("one"):
+            sessions.end("one")
+            sessions._live["one"] = Live()  # another request has begun it anew
+        return len(sessions)
+
+    assert asyncio.run(both()) == 1
