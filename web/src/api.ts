@@ -98,8 +98,12 @@ export function part(name: string | number): string {
   return encodeURIComponent(String(name));
 }
 
+// pictures of keyframes stay in the cache of the browser for ever; another database may be at this address the next time
+const LOADED = Date.now().toString(36);
+
 /** Shows a picture of the API in `image`: through the tag itself, or by fetch where a token is to be sent. */
-export function load(image: HTMLImageElement, address: string, until?: AbortSignal): void {
+export function load(image: HTMLImageElement, place: string, until?: AbortSignal): void {
+  const address = `${place}${place.includes("?") ? "&" : "?"}loaded=${LOADED}`;
   if (token.get() === null) {
     image.src = address;
     return;

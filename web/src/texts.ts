@@ -1,4 +1,5 @@
 // Every text of the page. A view has a member of its own; numbers and names come in as parameters.
+import { quoted } from "./ui/quoted";
 
 export const texts = {
   product: "semdb",
@@ -9,6 +10,7 @@ export const texts = {
   close: "Close",
   copy: "Copy",
   copied: "Copied",
+  copyByHand: "Copy it from the address bar: over plain HTTP browsers let no page copy",
   nav: {
     label: "Pages",
     maps: "Maps",
@@ -72,7 +74,7 @@ export const texts = {
     waiting: "Reading the map…",
     empty: "This map has no keyframes yet",
     emptyHint: "Fill it where the database is: ",
-    emptyCommand: (map: string) => `semdb ingest FOLDER --map '${map}'`,
+    emptyCommand: (map: string) => `semdb ingest FOLDER --map ${quoted(map)}`,
     noThings: "No things are known yet",
     noThingsHint: "They are found once by ",
     noThingsCommand: "semdb refine",
@@ -367,7 +369,7 @@ export const texts = {
   live: {
     none: "No camera is live in this map",
     noneHint: "A robot, or a recording that is played, appears here while it moves: ",
-    command: (map: string, origin: string) => `semdb track RECORDING --map '${map}' --server ${origin}`,
+    command: (map: string, origin: string) => `semdb track RECORDING --map ${quoted(map)} --server ${origin}`,
     cameras: "Cameras",
     unsure: "unsure",
     ago: (seconds: number) => (seconds < 2 ? "now" : `${Math.round(seconds)} s ago`),

@@ -1,5 +1,5 @@
 // What all views are made of.
-import { ApiError, isAbort } from "../api";
+import { ApiError, ask, isAbort } from "../api";
 import { go } from "../router";
 import { texts } from "../texts";
 import { type Child, fill, h } from "./h";
@@ -80,6 +80,28 @@ export function toast(text: string): void {
   const made = h("div", { class: "toast", attrs: { dir: "auto" } }, text);
   place.append(made);
   setTimeout(() => made.remove(), 6000);
+}
+
+/** Copies the address of what is shown. */
+export async function copyLink(): Promise<void> {
+  try {
+    await navigator.clipboard.writeText(location.href); // there is no clipboard over plain HTTP
+    toast(texts.copied);
+  } catch {
+    toast(texts.copyByHand);
+  }
+}
+
+/** Saves what the API answers as a file; a plain link would send no token. */
+export async function save(address: string, name: string, until: AbortSignal): Promise<void> {
+  try {
+    const answer = await ask(address, { until });
+    const url = URL.createObjectURL(await answer.blob());
+    h("a", { attrs: { href: url, download: name } }).click();
+    setTimeout(() => URL.revokeObjectURL(url), 1000);
+  } catch (error) {
+    if (!isAbort(error)) toast(error instanceof Error ? error.message : String(error));
+  }
 }
 
 /** Links of the page are followed without loading it anew. */

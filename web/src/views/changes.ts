@@ -69,7 +69,7 @@ export function changes({ root, until, params, query }: Context): Updatable {
 async function compare(map: string, query: URLSearchParams, until: AbortSignal): Promise<HTMLElement> {
   const t = texts.changes;
   const recordings = (await getAll<Recording>(`/v1/recordings?map=${part(map)}`, until)).filter((one) => one.keyframes > 0);
-  if (recordings.length < 2) return empty(t.tooFew, t.tooFewHint, [command(`semdb ingest FOLDER --map '${map}'`)]);
+  if (recordings.length < 2) return empty(t.tooFew, t.tooFewHint, [command(texts.map.emptyCommand(map))]);
   const before = query.get("before") ?? recordings.at(-2)?.name ?? "";
   const after = query.get("after") ?? recordings.at(-1)?.name ?? "";
   const choice = (name: "before" | "after", chosen: string, label: string): HTMLElement =>

@@ -1,11 +1,11 @@
 // Cameras that are tracked now, moving over the map.
-import { ask, part } from "../api";
+import { ApiError, ask, part } from "../api";
 import type { MapScene } from "../model";
 import { type Context } from "../router";
 import { texts } from "../texts";
 import type { Pose, Vector3 } from "../types";
 import { bdi, fill, h } from "../ui/h";
-import { command, empty, show } from "../ui/parts";
+import { command, empty, failed, show } from "../ui/parts";
 import { mapHead } from "../ui/tabs";
 import { TopMap } from "../ui/topmap";
 import { metres, place, sigmas } from "../ui/verdict";
@@ -69,8 +69,12 @@ class Watching {
             if (data) this.draw((JSON.parse(data.slice(6)) as { cameras: Camera[] }).cameras);
           }
         }
-      } catch {
+      } catch (error) {
         if (this.until.aborted) return;
+        if (error instanceof ApiError && [401, 403, 404].includes(error.status)) {
+          fill(this.note, failed(error, () => void this.follow()));
+          return; // it would be the same the next time
+        }
         fill(this.note, h("p", { class: "error-text" }, texts.live.lost));
       }
       await new Promise((done) => setTimeout(done, AGAIN_MS));

@@ -6,6 +6,7 @@ import { texts } from "../texts";
 import type { MapInfo, Pose, SeenObject } from "../types";
 import { bdi, fill, h } from "../ui/h";
 import { key } from "../ui/keys";
+import { quoted } from "../ui/quoted";
 import { a, button, command, empty, failed, show } from "../ui/parts";
 import { mapHead } from "../ui/tabs";
 import { TopMap } from "../ui/topmap";
@@ -67,7 +68,7 @@ export function locate({ root, until, params }: Context): void {
     dropped.set(null);
     void state.take(found);
   }, until);
-  if (results.childElementCount === 0) fill(results, empty(texts.locate.none, texts.locate.noneHint, [texts.locate.command, command(`semdb localize photo.jpg --map '${map}'`)]));
+  if (results.childElementCount === 0) fill(results, empty(texts.locate.none, texts.locate.noneHint, [texts.locate.command, command(`semdb localize photo.jpg --map ${quoted(map)}`)]));
 }
 
 class Locating {

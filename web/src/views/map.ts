@@ -6,7 +6,7 @@ import type { Layer, Mode, Picked, Viewer } from "../scene/viewer";
 import { texts } from "../texts";
 import { bdi, fill, h } from "../ui/h";
 import { key } from "../ui/keys";
-import { a, button, command, empty, loading, toast } from "../ui/parts";
+import { a, button, command, copyLink, empty, loading, toast } from "../ui/parts";
 import { theme } from "../ui/theme";
 import { showKeyframe } from "./map/keyframe";
 import { showLandmark } from "./map/landmark";
@@ -245,7 +245,7 @@ class MapView implements Updatable {
       ),
     );
     const layers = h("details", { class: "layers" }, h("summary", { class: "button" }, texts.map.layersLabel), h("div", { class: "layer-list" }, boxes));
-    const share = button(texts.map.share, () => void copy(), { class: "button quiet" });
+    const share = button(texts.map.share, () => void copyLink(), { class: "button quiet" });
     return h("div", { class: "toolbar" }, modes, button(texts.map.home, () => this.viewer?.home(), { title: "h" }), layers, share);
   }
 
@@ -258,11 +258,3 @@ class MapView implements Updatable {
   }
 }
 
-async function copy(): Promise<void> {
-  try {
-    await navigator.clipboard.writeText(location.href);
-    toast(texts.copied);
-  } catch (error) {
-    toast(error instanceof Error ? error.message : texts.errors.title);
-  }
-}

@@ -1,6 +1,6 @@
 // The log of what was localized: a list with filters, and one of them in detail.
 import { get, part } from "../api";
-import { type Context, type Updatable, link, setQuery } from "../router";
+import { type Context, type Updatable, go, link, setQuery } from "../router";
 import { texts } from "../texts";
 import type { LoggedQuery } from "../types";
 import { bdi, fill, h } from "../ui/h";
@@ -132,7 +132,8 @@ export function query({ root, until, params }: Context): void {
   const place = h("div");
   root.append(mapHead(map, "queries"), place);
   void show(place, until, async () => {
-    const found = await get<LoggedQuery>(`/v1/queries/${part(id)}`, until);
+    const found = await get<LoggedQuery & { map: string }>(`/v1/queries/${part(id)}`, until);
+    if (found.map !== map) go(link(["maps", found.map, "queries", id]), true); // its places are of that map
     const plan = await planOf(map, found.verdict, found.pose, null, found.candidates, until);
     return h(
       "div",

@@ -1,11 +1,11 @@
 // Statements: the schema at hand, questions to begin with, rows as a table, as CSV, or in the map.
-import { ApiError, ask, get, getAll } from "../api";
+import { ApiError, get, getAll } from "../api";
 import { type Context, type Updatable, link, setQuery } from "../router";
 import { texts } from "../texts";
 import type { MapInfo } from "../types";
 import { bdi, fill, h } from "../ui/h";
 import { key } from "../ui/keys";
-import { a, button, empty, failed, loading } from "../ui/parts";
+import { a, button, copyLink, empty, failed, loading, save } from "../ui/parts";
 import { rowsInMaps } from "./parts/rows";
 
 interface Schema {
@@ -102,7 +102,7 @@ class SqlPage {
 
   private share(): void {
     setQuery({ q: this.editor.value.trim() });
-    void navigator.clipboard?.writeText(location.href);
+    void copyLink();
   }
 
   async run(): Promise<void> {
@@ -146,19 +146,12 @@ class SqlPage {
         h("strong", null, texts.count(found.rows.length, t.row, t.rows)),
         h("span", { class: "faint" }, t.took(ms)),
         found.truncated && h("span", { class: "tag warn" }, t.truncated),
-        button(t.csv, () => void this.csv(text)),
+        button(t.csv, () => void save(`/v1/sql?${new URLSearchParams({ sql: text, format: "csv" })}`, "rows.csv", this.until)),
         rowsInMaps.can(found) && button(t.inMap, () => void rowsInMaps.show(map, found, this.until)),
       ),
       map,
       found.rows.length === 0 ? empty(t.noRows) : h("div", { class: "table-wrap rows", attrs: { tabindex: 0, role: "region", "aria-label": t.result } }, table),
     );
-  }
-
-  private async csv(text: string): Promise<void> {
-    const answer = await ask(`/v1/sql?${new URLSearchParams({ sql: text, format: "csv" })}`, { until: this.until });
-    const url = URL.createObjectURL(await answer.blob());
-    h("a", { attrs: { href: url, download: "rows.csv" } }).click();
-    setTimeout(() => URL.revokeObjectURL(url), 1000);
   }
 
   private async fillSide(side: HTMLElement): Promise<void> {

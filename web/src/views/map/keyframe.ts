@@ -1,11 +1,11 @@
 // A keyframe: its image with what is seen in it, what is near it, what it was good for.
-import { get, load, part } from "../../api";
+import { get, load, part, token } from "../../api";
 import { type KeyframeItem, css, distance, dot, hueColour } from "../../model";
 import { link } from "../../router";
 import { texts } from "../../texts";
 import type { KeypointColumns, LoggedQuery, RunLengths, SeenObject, Sighting } from "../../types";
 import { type Child, bdi, fill, h } from "../../ui/h";
-import { a, button, show } from "../../ui/parts";
+import { a, button, save, show } from "../../ui/parts";
 import { theme } from "../../ui/theme";
 import type { MapContext } from "../map";
 import { facts, metres, when } from "./facts";
@@ -40,7 +40,9 @@ export function showKeyframe(context: MapContext, item: KeyframeItem, place: HTM
     h(
       "p",
       { class: "row" },
-      h("a", { attrs: { href: `/v1/keyframes/${item.id}/image`, target: "_blank", rel: "noopener" } }, texts.keyframe.original),
+      token.get() === null
+        ? h("a", { attrs: { href: `/v1/keyframes/${item.id}/image`, target: "_blank", rel: "noopener" } }, texts.keyframe.original)
+        : button(texts.keyframe.original, () => void save(`/v1/keyframes/${item.id}/image`, `keyframe-${item.id}`, until)),
       a(link(["sql"], { q: `SELECT category, score, x1, y1, x2, y2 FROM keyframe_objects WHERE keyframe_id = ${item.id}` }), null, texts.keyframe.sql),
     ),
   );
