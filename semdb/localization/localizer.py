@@ -24,20 +24,16 @@ from semdb.localization.coarse import (
     retrieve,
 )
 from semdb.localization.confidence import Evidence
-from semdb.localization.edge_alignment import measure_edges, search_edges
-from semdb.localization.edge_step import EdgeVerdictOptions, weigh_edges
-from semdb.localization.edges import image_edges
+from semdb.localization.edge_step import EdgeVerdictOptions
 from semdb.localization.fallback import Fallback, FallbackOptions, asked_first, fallback_numbers, weigh_fallback
 from semdb.localization.keyframe_cache import KeyframeCache
-from semdb.localization.laid_pose import LaidOptions, LaidPose, estimate_with, is_one, judge_with, may_overrule
 from semdb.localization.landmark_pose import LandmarkPoseOptions
 from semdb.localization.landmark_step import landmark_pose
+from semdb.localization.laying import Laying, rival_of, with_laid
 from semdb.localization.learned_matching import for_learned, is_learned
 from semdb.localization.neighbours import by_side
 from semdb.localization.pose import (
-    PoseEstimate,
     estimate_pose,
-    find_rival,
     first_pose,
     match_views,
     recorded_covariance,
@@ -45,17 +41,13 @@ from semdb.localization.pose import (
 from semdb.localization.pose_options import PoseOptions
 from semdb.localization.search import Search, best_pairs, evidence_of, numbers_of
 from semdb.localization.sources import TimedSource
-from semdb.localization.surface_search import search_surfaces
-from semdb.localization.surface_step import SurfaceVerdictOptions, weigh_surfaces
-from semdb.localization.surfaces import Surfaces, surfaces_of
+from semdb.localization.surface_step import SurfaceVerdictOptions
 from semdb.localization.verdict import Judgement, VerdictOptions, convinces, judge
 from semdb.localization.views import View, in_kind_of, make_view
 from semdb.perception.quality import complaint_of, image_quality, motion_blur
 from semdb.types import (
     Candidate,
-    ConsistentPose,
     Description,
-    FloatArray,
     Localization,
     ModelInfo,
     Tolerance,
@@ -118,6 +110,8 @@ class Localizer:
         self.source = source
         self.cache = cache
         self.options = (options or LocalizerOptions()).for_models(self.models)
+        of = self.options
+        self.laying = Laying(cache, of.surfaces, of.edges, of.verdict, of.pose.use_query_depth)
         self.confusions = confusions or {}  # class -> classes it is taken for -> weight in millionths
 
     def localize(self, description: Description, accept: Tolerance | None = None) -> Localization:
@@ -238,11 +232,8 @@ class Localizer:
             )
         started = time.perf_counter()
         if not convinced or judgement.verdict is not Verdict.LOCALIZED:
-            for lay, options in ((self._lay_surfaces, self.options.surfaces), (self._lay_edges, self.options.edges)):
-                laid = lay(search, description) if search.keyframes else None
-                if laid is None or options is None:
-                    continue
-                judgement, evidence = self._with_laid(search, laid, options, convinced, judgement, evidence)
+            for laid, options in self.laying.poses(search, description):
+                judgement, evidence = with_laid(search, laid, options, convinced, judgement, evidence)
                 if laid.is_sure:
                     break
         search.timing_ms["pose"] += _ms_since(started)
@@ -264,7 +255,7 @@ class Localizer:
         started = time.perf_counter()
         evidence, bounds = None, self.options.verdict.accepting(search.accept)
         if search.estimate is not None:
-            rival = self._rival(search, search.estimate)
+            rival = rival_of(search, search.estimate)
             evidence = evidence_of(search, search.estimate, 0 if rival is None else rival.inliers)
             if rival is not None and rival.inliers > bounds.rival_share * evidence.first_of_best:
                 search.others.append(rival)
@@ -319,86 +310,6 @@ class Localizer:
             return Judgement(Verdict.FAILED, judgement.confidence, f"{judgement.reason}; {doubt}")
         reason = f"{judgement.reason}; {found.matched} landmarks agree, of {found.expected} in view"
         return Judgement(Verdict.COARSE, judgement.confidence, reason)
-
-    def _with_laid(
-        self,
-        search: Search,
-        laid: LaidPose,
-        options: LaidOptions,
-        convinced: bool,
-        judgement: Judgement,
-        evidence: Evidence | None,
-    ) -> tuple[Judgement, Evidence | None]:
-        """Verdict and evidence after a query was laid on the map; the pose with them."""
-        before, overrule = search.estimate, False
-        search.laid.append(laid)
-        if laid.is_sure:
-            found = estimate_with(laid, search.query, search.keyframes, search.matches, options, search.pose)
-            rival = self._rival(search, found)
-            anew = evidence_of(search, found, 0 if rival is None else rival.inliers)
-            overrule = may_overrule(convinced, anew, laid, options)
-            if overrule:
-                search.estimate, evidence = found, anew
-                search.others.clear()
-        after = judge_with(judgement, before, laid, options, overrule, search.accept)
-        if after is not judgement and after.verdict is Verdict.AMBIGUOUS:
-            search.others.append(ConsistentPose(laid.world_from_camera, laid.support))
-        return after, evidence
-
-    def _rival(self, search: Search, estimate: PoseEstimate) -> ConsistentPose | None:
-        """The best pose elsewhere that the caller would not accept for `estimate`."""
-        found = find_rival(search.query, search.keyframes, search.matches, estimate, search.pose)
-        if found is None or search.accept is None:
-            return found
-        return None if is_one(found.world_from_camera, estimate.world_from_camera, search.accept) else found
-
-    def _lay_surfaces(self, search: Search, description: Description) -> LaidPose | None:
-        """The pose of a query's depth on the surfaces of the map, where it has depth."""
-        options = self.options.surfaces
-        surfaces = None if options is None else self._surfaces_of(description)
-        if options is None or surfaces is None:
-            return None
-        starts, fit = self._starts(search, options.fit.starts), options.fit
-        fits = search_surfaces(surfaces, starts, lambda pose: self.cache.surfaces_near(pose, fit.keyframes), fit)
-        limits, accept = self._limits(search), search.accept
-        return weigh_surfaces(fits, search.query, search.keyframes, search.matches, options, limits, accept)
-
-    def _lay_edges(self, search: Search, description: Description) -> LaidPose | None:
-        """The pose of a query's edges on those of the map."""
-        options = self.options.edges
-        if options is None or description.grey is None:
-            return None
-        starts, fit = self._starts(search, options.fit.starts), options.fit
-        edges = image_edges(description.camera, description.grey)
-        fits = search_edges(edges, starts, lambda pose: self.cache.edges_near(pose, fit.keyframes), fit)
-        own = None
-        if search.estimate is not None:
-            pose = search.estimate.world_from_camera
-            own = measure_edges(edges, self.cache.edges_near(pose, fit.keyframes), pose, fit.fine[-1])
-        return weigh_edges(
-            fits, own, search.query, search.keyframes, search.matches, options, self._limits(search), search.accept
-        )
-
-    def _limits(self, search: Search) -> tuple[float, float]:
-        """What standard deviations (m, deg) a pose may have that is sure."""
-        bounds = self.options.verdict.accepting(search.accept)
-        return bounds.maximum_translation_sigma_m, bounds.maximum_rotation_sigma_deg
-
-    def _surfaces_of(self, description: Description) -> Surfaces | None:
-        """Those of a query, where it has depth that may be used."""
-        if description.depth is None or description.grey is None or not self.options.pose.use_query_depth:
-            return None
-        return surfaces_of(description.camera, description.depth, description.grey)
-
-    def _starts(self, search: Search, keyframes: int) -> list[FloatArray]:
-        """Poses from which a query is laid: that of the keypoints, and those of the likeliest keyframes."""
-        estimate = search.estimate
-        order = list(range(len(search.keyframes)))
-        if estimate is not None:
-            counts = [*estimate.per_keyframe, *[0] * (len(order) - len(estimate.per_keyframe))]
-            order.sort(key=lambda slot: -counts[slot])
-        starts = [] if estimate is None else [estimate.world_from_camera]
-        return starts + [search.keyframes[slot].world_from_camera for slot in order[:keyframes]]
 
     def _ask_neighbours(self, search: Search) -> None:
         """Keyframes near the first pose see the same things from elsewhere: their pairs steady the pose."""
