@@ -18,7 +18,7 @@ from semdb.database.records import RecordingStatus
 from semdb.errors import NotFoundError, SemdbError, UsageError
 from semdb.recordings.arrays import as_camera
 from semdb.recordings.images import header_of
-from semdb.service import schemas
+from semdb.service import job_schemas
 from semdb.service.access import admit
 from semdb.service.answers import as_json, encoded
 from semdb.service.ingesting import path_below
@@ -56,7 +56,7 @@ class NewIngest(BaseModel):
     check: bool = True
 
 
-@table.route("POST", "/v1/maps/{map}/ingest", INGEST, schemas.JobModel, status=202, errors=(404, 501))
+@table.route("POST", "/v1/maps/{map}/ingest", INGEST, job_schemas.JobModel, status=202, errors=(404, 501))
 async def ingest(request: Request, map: MapName, body: Annotated[NewIngest, Body()]) -> Response:
     """Plans a recording and leaves it to the workers, or ingests it here where the database is a file: a job.
 
@@ -89,7 +89,7 @@ def new_job(db: Database, map: str, who: str, asked: Mapping[str, Any]) -> Job:
     return db.job(db.add_job(map, who, asked))
 
 
-@table.route("GET", "/v1/jobs/{job}", INGEST, schemas.JobModel)
+@table.route("GET", "/v1/jobs/{job}", INGEST, job_schemas.JobModel)
 async def get_job(request: Request, job: JobId) -> Response:
     """What became of a job, and how far it is."""
     return as_json(await _look(request, job))
@@ -192,7 +192,7 @@ def job_dict(job: Job, items: dict[str, int] | None, now: tuple[str, int, int] |
     "POST",
     "/v1/uploads",
     INGEST,
-    schemas.UploadModel,
+    job_schemas.UploadModel,
     status=201,
     errors=(507,),
     extra={
@@ -223,7 +223,7 @@ async def upload(
     return as_json({"upload": made.id, "name": name, "bytes": size}, 201)
 
 
-@table.route("POST", "/v1/uploads/live", INGEST, schemas.UploadModel, status=201, errors=(507,))
+@table.route("POST", "/v1/uploads/live", INGEST, job_schemas.UploadModel, status=201, errors=(507,))
 async def live(request: Request, name: Annotated[str, Query(max_length=100, examples=["kitchen-3"])]) -> Response:
     """Opens an upload that takes frame by frame; `ingest` takes it when all are there."""
     service, access = service_of(request), access_of(request)
@@ -231,7 +231,7 @@ async def live(request: Request, name: Annotated[str, Query(max_length=100, exam
     return as_json({"upload": made.id, "name": name, "bytes": 0}, 201)
 
 
-@table.route("POST", "/v1/uploads/{upload_id}/frames", INGEST, schemas.UploadModel, status=201, errors=(409, 507))
+@table.route("POST", "/v1/uploads/{upload_id}/frames", INGEST, job_schemas.UploadModel, status=201, errors=(409, 507))
 async def add_frame(
     request: Request,
     upload_id: UploadId,

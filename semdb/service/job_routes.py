@@ -13,7 +13,7 @@ from semdb.database.jobs import DONE, FAILED, PLANNED, Job
 from semdb.database.records import RecordingStatus
 from semdb.errors import SemdbError
 from semdb.recordings.roots import check_root
-from semdb.service import schemas
+from semdb.service import job_schemas, schemas
 from semdb.service.answers import as_json, page_of
 from semdb.service.ingest_routes import JobId, items_of, job_dict, job_of, new_job
 from semdb.service.problems import Problem, scrubbed
@@ -25,7 +25,7 @@ table = Table("jobs")
 MOST_ENTRIES = 500
 
 
-@table.route("GET", "/v1/jobs", INGEST, schemas.Page[schemas.JobModel])
+@table.route("GET", "/v1/jobs", INGEST, schemas.Page[job_schemas.JobModel])
 async def list_jobs(
     request: Request,
     map: Annotated[str | None, Query(max_length=255, description="only of this map")] = None,
@@ -48,7 +48,7 @@ async def list_jobs(
     return page_of(request, await read(request, look), most, lambda one: one["job"], lambda one: one, by="before")
 
 
-@table.route("POST", "/v1/jobs/{job}/retry", INGEST, schemas.JobModel, status=202, errors=(409,))
+@table.route("POST", "/v1/jobs/{job}/retry", INGEST, job_schemas.JobModel, status=202, errors=(409,))
 async def retry_job(request: Request, job: JobId) -> Response:
     """Does a job that ended once more, as a new job: keyframes that failed are tried again, none is stored twice."""
     service, access = service_of(request), access_of(request)
@@ -67,7 +67,7 @@ async def retry_job(request: Request, job: JobId) -> Response:
     return as_json(job_dict(made, None, None), 202)
 
 
-@table.route("GET", "/v1/ingest/sources", INGEST, schemas.Sources)
+@table.route("GET", "/v1/ingest/sources", INGEST, job_schemas.Sources)
 async def list_sources(request: Request) -> Response:
     """What lies directly below the folders of which recordings may be ingested, by name; `path` is for `ingest`."""
     roots = service_of(request).settings.roots
@@ -95,7 +95,7 @@ def _entries(roots: tuple[str, ...]) -> list[dict[str, Any]]:
     return sorted(found.values(), key=lambda one: one["path"])
 
 
-@table.route("GET", "/v1/maps/{map}/recordings/{recording}/failures", INGEST, schemas.Failures)
+@table.route("GET", "/v1/maps/{map}/recordings/{recording}/failures", INGEST, job_schemas.Failures)
 async def list_failures(request: Request, map: MapName, recording: str) -> Response:
     """The keyframes of a recording that could not be stored, and why."""
     found = await read(request, lambda db: db.failures(recording, map))

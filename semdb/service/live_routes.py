@@ -11,7 +11,7 @@ from fastapi import Request
 from starlette.responses import Response, StreamingResponse
 
 from semdb.errors import SemdbError
-from semdb.service import schemas
+from semdb.service import session_schemas
 from semdb.service.access import admit
 from semdb.service.answers import as_json, encoded
 from semdb.service.ingest_routes import LONGEST_STREAM_S, MOST_STREAMS
@@ -26,7 +26,7 @@ STILL_S = 5.0  # without news a line is sent all the same: so long it takes to n
 ADMIT_S = 5.0
 
 
-@table.route("GET", "/v1/maps/{map}/live", READ, schemas.LiveCameras)
+@table.route("GET", "/v1/maps/{map}/live", READ, session_schemas.LiveCameras)
 async def list_live(request: Request, map: MapName) -> Response:
     """The cameras that sessions of this process track in a map: their last poses, and where they came from."""
     await read(request, lambda db: db.map(map))

@@ -11,8 +11,8 @@ Matrix = list[list[float]]
 ItemT = TypeVar("ItemT")
 
 
-_POSE = {"position": [-0.19, 1.35, 1.42], "quat_wxyz": [0.394, -0.49, -0.596, 0.5]}
-_MATRIX = [[-0.21, 0.19, -0.96, -0.19], [0.98, 0.02, -0.21, 1.35], [-0.02, -0.98, -0.19, 1.42], [0.0, 0.0, 0.0, 1.0]]
+POSE = {"position": [-0.19, 1.35, 1.42], "quat_wxyz": [0.394, -0.49, -0.596, 0.5]}
+MATRIX = [[-0.21, 0.19, -0.96, -0.19], [0.98, 0.02, -0.21, 1.35], [-0.02, -0.98, -0.19, 1.42], [0.0, 0.0, 0.0, 1.0]]
 _CAMERA = {"width": 640, "height": 480, "fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5, "distortion": []}
 _KEYFRAME = {
     "id": 1,
@@ -21,8 +21,8 @@ _KEYFRAME = {
     "frame_index": 12,
     "timestamp_ns": 1305031452791720000,
     "camera": _CAMERA,
-    "pose": _POSE,
-    "world_from_camera": _MATRIX,
+    "pose": POSE,
+    "world_from_camera": MATRIX,
 }
 _OBJECT = {
     "id": None,
@@ -33,14 +33,14 @@ _OBJECT = {
     "extent": [0.5, 0.9, 0.5],
 }
 _CANDIDATE = {"keyframe": 1, "recording": "rgbd_dataset_freiburg1_desk", "frame_index": 12}
-_ANSWER = {
+ANSWER = {
     "image": "image",
     "frame_index": None,
     "timestamp_ns": None,
     "verdict": "localized",
     "map": "office",
-    "pose": _POSE,
-    "world_from_camera": _MATRIX,
+    "pose": POSE,
+    "world_from_camera": MATRIX,
     "covariance": [[1e-6 if row == column else 0.0 for column in range(6)] for row in range(6)],
     "confidence": 0.99,
     "inliers": 322,
@@ -59,29 +59,6 @@ _ANSWER = {
 def example(content: dict[str, Any]) -> ConfigDict:
     """The configuration of a model with an example."""
     return ConfigDict(extra="allow", json_schema_extra={"examples": [content]})
-
-
-_TRACKED = {
-    "image": "image",
-    "frame_index": None,
-    "timestamp_ns": 1_700_000_000_000_000_000,
-    "time_s": 1_700_000_000.0,
-    "state": "tracking",
-    "source": "tracked",
-    "map": "office",
-    "pose": _POSE,
-    "world_from_camera": _MATRIX,
-    "covariance": _ANSWER["covariance"],
-    "inliers": 210,
-    "confidence": None,
-    "reason": "210 keypoints agree with 4 keyframes",
-    "map_from_odom": None,
-    "map_from_odom_matrix": None,
-    "smoothed": False,
-    "latency_ms": 21.0,
-    "frames": 12,
-    "notes": [],
-}
 
 
 class Model(BaseModel):
@@ -262,7 +239,7 @@ class MatchedModel(Model):
 class Answer(Model):
     """Where an image was taken. A pose for all but `failed`, which is an answer, too; `coarse` is good to 0.5 m."""
 
-    model_config = example(_ANSWER)
+    model_config = example(ANSWER)
 
     image: str
     verdict: Literal["localized", "ambiguous", "coarse", "failed"]
@@ -295,124 +272,11 @@ class Batch(Model):
     items: list[BatchItem]
 
 
-class Session(Model):
-    """A camera that is tracked: where its frames go. `tracking`: an answer knows the ones before."""
-
-    session: str
-    map: str
-    seconds: int = Field(description="how long it is valid")
-    idle_seconds: float = Field(description="after so long without a frame the camera is looked for anew")
-    frames: str = Field(examples=["/v1/sessions/SESSION/frames"])
-    stream: str = Field(examples=["/v1/sessions/SESSION/stream"])
-    tracking: bool
-
-
-class Tracked(Model):
-    """Where a moving camera is. Only in the state `tracking` is the pose measured in the map in this image."""
-
-    model_config = example(_TRACKED)
-
-    image: str
-    time_s: float
-    state: Literal["initialising", "tracking", "coasting", "lost"]
-    source: Literal["tracked", "relocalised", "odometry", "predicted", "none"]
-    map: str
-    pose: Pose | None
-    world_from_camera: Matrix | None
-    covariance: Matrix | None = Field(description="6x6: translation (m), then rotation (rad)")
-    inliers: int
-    confidence: float | None = Field(description="of a pose that was looked for in the whole map")
-    reason: str
-    map_from_odom: Pose | None = Field(description="corrects the odometry, where frames bring it")
-    map_from_odom_matrix: Matrix | None
-    latency_ms: float
-    frames: int = Field(description="of this camera so far, as this process knows it: 1 where it is looked for anew")
-    notes: list[str] = Field(description="what was assumed")
-
-
-class Ended(Model):
-    """The camera was let go."""
-
-    ended: bool
-
-
 class DeletedModel(Model):
     """What was deleted."""
 
     recordings: int
     keyframes: int
-
-
-class JobModel(Model):
-    """A job: `waiting`, `running`, `working` (workers have it), `done` or `failed`."""
-
-    job: int
-    address: str = Field(examples=["/v1/jobs/1"])
-    map: str
-    state: str = Field(examples=["running"])
-    recordings: list[dict[str, Any]]
-    items: dict[str, int] | None = Field(description="keyframes by their state", examples=[{"done": 4, "pending": 2}])
-    progress: dict[str, Any] | None = Field(examples=[{"what": "ingesting room", "done": 4, "total": 6}])
-    error: str | None
-
-
-class Watched(Model):
-    """A camera that is tracked: its last answer, and where it came from. `age_s`: so long ago its last frame came."""
-
-    camera: str = Field(examples=["9f2c51aa"])
-    frames: int
-    age_s: float
-    path: list[Vector3]
-    state: str
-    pose: Pose | None
-    covariance: Matrix | None
-
-
-class LiveCameras(Model):
-    """The cameras that this process tracks in a map."""
-
-    map: str
-    cameras: list[Watched]
-
-
-class Source(Model):
-    """What may be ingested: its `path` below one of the folders that are set."""
-
-    path: str = Field(examples=["rgbd_dataset_freiburg1_desk"])
-    kind: Literal["folder", "file"]
-    bytes: int | None
-
-
-class Sources(Model):
-    """What may be ingested by path. `paths`: whether any folder is set."""
-
-    paths: bool
-    entries: list[Source]
-    truncated: bool
-
-
-class Failure(Model):
-    """A keyframe that could not be stored."""
-
-    frame_index: int
-    attempts: int
-    error: str
-
-
-class Failures(Model):
-    """What could not be stored of a recording."""
-
-    map: str
-    recording: str
-    failures: list[Failure]
-
-
-class UploadModel(Model):
-    """Files that came: `upload` is what `ingest` takes."""
-
-    upload: str
-    name: str
-    bytes: int
 
 
 class Landmark(Model):
@@ -489,43 +353,6 @@ class CoverageModel(Model):
     low: Vector3 | None
     high: Vector3 | None
     directions: list[int]
-
-
-class Rows(Model):
-    """Rows of a statement. `truncated`: there were more."""
-
-    columns: list[str]
-    rows: list[list[Any]]
-    truncated: bool
-
-
-class AboutTable(Model):
-    """What a table or view is for, and what its columns are."""
-
-    kind: Literal["table", "view"]
-    about: str
-    columns: dict[str, str]
-
-
-class Tables(Model):
-    """Columns by table or view, and what those of the schema are for."""
-
-    tables: dict[str, list[str]]
-    about: dict[str, AboutTable]
-
-
-class Question(Model):
-    """A statement of the cookbook."""
-
-    title: str
-    about: str
-    sql: str
-
-
-class Questions(Model):
-    """The statements of docs/sql.md."""
-
-    questions: list[Question]
 
 
 class Health(Model):

@@ -20,7 +20,7 @@ from starlette.responses import Response
 from starlette.websockets import WebSocketDisconnect
 
 from semdb.errors import SemdbError
-from semdb.service import schemas
+from semdb.service import session_schemas
 from semdb.service.access import admit
 from semdb.service.answers import as_json, encoded
 from semdb.service.localize_routes import (
@@ -69,7 +69,7 @@ class NewSession(BaseModel):
     categories: dict[str, str] | None = Field(None, max_length=1000)
 
 
-@table.route("POST", "/v1/maps/{map}/sessions", LOCALIZE, schemas.Session, status=201, errors=(404, 409))
+@table.route("POST", "/v1/maps/{map}/sessions", LOCALIZE, session_schemas.Session, status=201, errors=(404, 409))
 async def open_session(
     request: Request, map: MapName, body: Annotated[NewSession, Body(default_factory=NewSession)]
 ) -> Response:
@@ -98,7 +98,7 @@ async def open_session(
     return as_json(content, 201)
 
 
-@table.route("POST", "/v1/sessions/{session}/frames", LOCALIZE, schemas.Tracked, errors=(404, 409))
+@table.route("POST", "/v1/sessions/{session}/frames", LOCALIZE, session_schemas.Tracked, errors=(404, 409))
 async def track_frame(
     request: Request,
     session: str,
@@ -137,7 +137,7 @@ async def track_frame(
     return as_json(answer)
 
 
-@table.route("DELETE", "/v1/sessions/{session}", LOCALIZE, schemas.Ended)
+@table.route("DELETE", "/v1/sessions/{session}", LOCALIZE, session_schemas.Ended)
 async def end_session(request: Request, session: str) -> Response:
     """Lets a camera go, so that there is a place for another one; one that sends nothing is let go by itself."""
     service_of(request).sessions.end(_common(request, session).id)

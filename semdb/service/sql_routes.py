@@ -15,7 +15,7 @@ from starlette.responses import Response
 
 from semdb.errors import DatabaseError, DatabaseUnavailableError, SchemaError, UsageError
 from semdb.jsonable import to_jsonable
-from semdb.service import schemas
+from semdb.service import sql_schemas
 from semdb.service.answers import as_json
 from semdb.service.problems import Problem, scrubbed
 from semdb.service.roles import ADMIN, READ
@@ -34,7 +34,7 @@ def for_all_maps(request: Request) -> None:
         raise Problem(403, "a statement sees all maps, and this token is for one")
 
 
-@table.route("GET", "/v1/sql", READ, schemas.Rows, also={"text/csv": {"schema": {"type": "string"}}})
+@table.route("GET", "/v1/sql", READ, sql_schemas.Rows, also={"text/csv": {"schema": {"type": "string"}}})
 async def get_sql(
     request: Request,
     sql: Annotated[str, Query(min_length=1, max_length=LONGEST, description="one SELECT", examples=["SELECT 1"])],
@@ -94,7 +94,7 @@ def _csv(columns: list[str], rows: list[list[Any]]) -> str:
     return text.getvalue()
 
 
-@table.route("GET", "/v1/tables", READ, schemas.Tables)
+@table.route("GET", "/v1/tables", READ, sql_schemas.Tables)
 async def get_tables(request: Request) -> Response:
     """Tables and views that statements can ask, with their columns, and what these are for."""
     for_all_maps(request)
@@ -103,7 +103,7 @@ async def get_tables(request: Request) -> Response:
     return as_json({"tables": {name: list(columns) for name, columns in found.items()}, "about": about})
 
 
-@table.route("GET", "/v1/questions", READ, schemas.Questions)
+@table.route("GET", "/v1/questions", READ, sql_schemas.Questions)
 async def get_questions(request: Request) -> Response:
     """Statements to begin with: those of the cookbook, docs/sql.md."""
     return as_json({"questions": page_texts()["questions"]})
