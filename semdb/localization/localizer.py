@@ -33,6 +33,7 @@ from semdb.localization.laying import Laying, rival_of, with_laid
 from semdb.localization.learned_matching import for_learned, is_learned
 from semdb.localization.neighbours import by_side
 from semdb.localization.pose import (
+    PoseEstimate,
     estimate_pose,
     first_pose,
     match_views,
@@ -48,6 +49,7 @@ from semdb.perception.quality import complaint_of, image_quality, motion_blur
 from semdb.types import (
     Candidate,
     Description,
+    FloatArray,
     Localization,
     ModelInfo,
     Tolerance,
@@ -75,6 +77,7 @@ class LocalizerOptions:
     blur: BlurOptions | None = field(default_factory=BlurOptions)  # of a query that motion has blurred
     landmarks: LandmarkPoseOptions | None = field(default_factory=LandmarkPoseOptions)  # where keypoints fail
     fallback: bool = True  # whether the other feature is asked that settings name, where keypoints do not convince
+    recorded_errors: bool = True  # whether covariances count by how far recorded poses are off
     accept: Tolerance | None = None  # how far poses may differ that are one, where a query does not say
     twin_cosine: float = 0.05  # how much less than the best keyframe's cosine is "as much"
 
@@ -372,7 +375,7 @@ class Localizer:
             verdict=judgement.verdict,
             map_name=self.map_name,
             world_from_camera=None if pose is None else pose.world_from_camera,
-            covariance=coarse.covariance if coarse is not None else recorded_covariance(estimate),
+            covariance=coarse.covariance if coarse is not None else self._covariance(estimate),
             confidence=judgement.confidence,
             inliers=0 if search.estimate is None else search.estimate.inliers,
             stage=search.stage,
@@ -388,6 +391,11 @@ class Localizer:
             query_xy=query_xy,
             keyframe_xy=keyframe_xy,
         )
+
+    def _covariance(self, estimate: PoseEstimate | None) -> FloatArray | None:
+        if estimate is None or not self.options.recorded_errors:
+            return None if estimate is None else estimate.covariance
+        return recorded_covariance(estimate)
 
     def _candidates(self, search: Search, inliers: dict[int, int]) -> tuple[Candidate, ...]:
         return tuple(

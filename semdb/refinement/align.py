@@ -20,6 +20,7 @@ from semdb.geometry import pose_distances, pose_error
 from semdb.geometry.volumes import Volume, volume_of
 from semdb.localization.images import localizer_on
 from semdb.localization.index import IndexSource, MapIndex
+from semdb.localization.localizer import LocalizerOptions
 from semdb.localization.stored_query import stored_queries
 from semdb.settings import Settings
 from semdb.trajectory.edges import EdgeArrays, EdgeState
@@ -213,7 +214,9 @@ def _localized(
 ) -> dict[int, Localization]:
     """What localizing each keyframe in the map gives, by id."""
     source = IndexSource(MapIndex.open(store, target.id, say=say))
-    localizer = localizer_on(source, store, target, settings=settings, say=say)
+    # what recorded poses are off by is the graph's to find
+    options = LocalizerOptions(recorded_errors=False)
+    localizer = localizer_on(source, store, target, options, settings=settings, say=say)
     models = store.map_models(target.id)
     found: dict[int, Localization] = {}
     for done, (keyframe, description) in enumerate(stored_queries(store, list(mine.number), models), 1):
