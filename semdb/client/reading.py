@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
+from urllib.parse import parse_qs, urlsplit
 
 from semdb.client.content import RemoteContent
 from semdb.client.transport import Transport, segment
@@ -199,14 +200,16 @@ class Reading:
 
     def _pages(self, path: str, limit: int | None = None, **parameters: Any) -> Iterator[Any]:
         """The items of a list, page by page."""
-        left, key = limit, parameters.pop("after", None)
+        by = "before" if "before" in parameters else "after"  # lists with the newest first go backwards
+        left, key = limit, parameters.pop(by, None)
         while left is None or left > 0:
-            page = self._get(path, **parameters, after=key, limit=PAGE if left is None else min(PAGE, left))
+            page = self._get(path, **parameters, **{by: key}, limit=PAGE if left is None else min(PAGE, left))
             yield from page["items"]
             left = None if left is None else left - len(page["items"])
             key = page["key"]
             if key is None:
                 return
+            by = "before" if "before" in parse_qs(urlsplit(str(page["next"])).query) else "after"
 
 
 def _text(value: Any) -> str:

@@ -135,6 +135,8 @@ class Transport:
 
         `body` makes what is sent, for each time anew. Raises SemdbError.
         """
+        if not path.startswith("/"):  # behind the address it could name another host, which would get the token
+            raise UsageError(f"{for_terminal(path)!r}: a path of the service begins with a slash, as /v1/maps")
         harmless = again if again is not None else method == "GET"
         ends = time.monotonic() + self.patience_s
         for number in range(self.retries + 1):

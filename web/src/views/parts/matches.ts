@@ -20,7 +20,7 @@ export async function matchesFigure(
   keyframe: { camera: { width: number; height: number }; recording: string; frame_index: number },
   until: AbortSignal,
 ): Promise<HTMLElement> {
-  const bitmap = await createImageBitmap(photo);
+  const bitmap = await createImageBitmap(photo, { imageOrientation: "none" }); // pixels as stored, as the service has them
   const [width, height] = [bitmap.width, bitmap.height];
   bitmap.close();
   const { camera } = keyframe;
