@@ -35,7 +35,8 @@ def _inside(image: Any, x: float, y: float, reach: float) -> bool:
     return x - reach >= 0 and y - reach >= 0 and x + reach < image.shape[1] - 1 and y + reach < image.shape[0] - 1
 
 
-@kernel(fastmath=True)
+# inlined: a process that compiles this would else run another copy of it, with other last bits, than one that loads it
+@kernel(fastmath=True, forceinline=True)
 def _linear_basis(template: Any, x: float, y: float, step: float, warp: Any, grid: Any, basis: Any) -> None:
     """Fills `basis` ``[4, n]``: the patch's change as it moves by a pixel of the other image in x, y; itself; one."""
     a, b, c, d = warp[0, 0], warp[0, 1], warp[1, 0], warp[1, 1]

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -108,3 +113,24 @@ def test_what_cannot_be_aligned_is_not() -> None:
     other = np.asarray(np.clip(texture(8), 0, 255), np.uint8)
     _, likeness = align(image, other, np.eye(2), np.zeros(2))
     assert (likeness > 0.9).mean() < 0.1
+
+
+@pytest.mark.long
+def test_a_process_that_compiles_gives_the_bits_of_one_that_loads(tmp_path: Path) -> None:
+    code = (
+        "import cv2, numpy as np; from semdb.localization.alignment_kernels import align_patches;"
+        "rng = np.random.default_rng(0); n = 200;"
+        "image = cv2.GaussianBlur(rng.integers(0, 256, (240, 320), np.uint8), (0, 0), 2.0);"
+        "at = rng.uniform(40, 200, (n, 2)); found, alike = np.zeros((n, 2)), np.zeros(n);"
+        "warp = np.eye(2) + rng.normal(0, 0.05, (n, 2, 2));"
+        "other = np.roll(image, 1, axis=1);"
+        "align_patches(image, other, at, warp, rng.uniform(0.8, 1.5, n), at + 1.3, found, alike);"
+        "print(int((alike > 0.5).sum()), found.tobytes().hex())"
+    )
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    first, second = (
+        subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True).stdout
+        for _ in range(2)
+    )
+    assert int(first.split()[0]) > 50
+    assert first == second
