@@ -83,6 +83,8 @@ def _entries(roots: tuple[str, ...]) -> list[dict[str, Any]]:
         except OSError:
             continue
         for entry in entries:
+            if len(found) > MOST_ENTRIES:
+                break
             if entry.name.startswith(".") or entry.name in found:
                 continue
             try:
