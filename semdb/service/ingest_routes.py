@@ -27,15 +27,14 @@ from semdb.service.problems import Problem, busy, not_found
 from semdb.service.roles import ADMIN, INGEST, Access
 from semdb.service.routing import MapName, Table
 from semdb.service.state import access_of, read, service_of
+from semdb.service.streams import LONGEST_S
 from semdb.service.uploads import live_frame, packed_of
 from semdb.service.values import camera_dict
 from semdb.storable_names import name_problem
 
 table = Table("ingest")
 MOST_JOBS = 1000
-MOST_STREAMS = 32
 EVENT_S = 1.0
-LONGEST_STREAM_S = 3600.0
 JobId = Annotated[int, Path(ge=1, le=2**63 - 1)]
 UploadId = Annotated[str, Path(max_length=64)]
 
@@ -100,31 +99,29 @@ async def follow_job(request: Request, job: JobId) -> Response:
     """A job as server-sent events: `progress` when something changed, `end` when it is done or failed."""
     service = service_of(request)
     first = await _look(request, job)
-    if service.streams >= MOST_STREAMS:
-        raise busy("too many jobs are followed", 10)
+    who = access_of(request).who
+    service.streams.check(who)
 
     async def events() -> AsyncIterator[bytes]:
-        service.streams += 1
+        shown, ends = first, time.monotonic() + LONGEST_S
+        said = b""
         try:
-            shown, ends = first, time.monotonic() + LONGEST_STREAM_S
-            said = b""
-            while True:
-                over = shown["state"] in (DONE, FAILED)
-                text = encoded(shown)
-                if text != said or over:
-                    said = text
-                    yield b"event: " + (b"end" if over else b"progress") + b"\ndata: " + text + b"\n\n"
-                else:
-                    yield b": still\n\n"
-                if over or service.stopping or time.monotonic() > ends:
-                    return
-                await asyncio.sleep(EVENT_S)
-                await admit(request, INGEST)
-                shown = await _look(request, job)
+            with service.streams.one(who):
+                while True:
+                    over = shown["state"] in (DONE, FAILED)
+                    text = encoded(shown)
+                    if text != said or over:
+                        said = text
+                        yield b"event: " + (b"end" if over else b"progress") + b"\ndata: " + text + b"\n\n"
+                    else:
+                        yield b": still\n\n"
+                    if over or service.stopping or time.monotonic() > ends:
+                        return
+                    await asyncio.sleep(EVENT_S)
+                    await admit(request, INGEST)
+                    shown = await _look(request, job)
         except (Problem, SemdbError):  # nothing can be said any more: whoever follows comes again, and is told
             return
-        finally:
-            service.streams -= 1
 
     return StreamingResponse(events(), 200, {"X-Accel-Buffering": "no"}, "text/event-stream")
 

@@ -14,11 +14,11 @@ from semdb.errors import SemdbError
 from semdb.service import session_schemas
 from semdb.service.access import admit
 from semdb.service.answers import as_json, encoded
-from semdb.service.ingest_routes import LONGEST_STREAM_S, MOST_STREAMS
-from semdb.service.problems import Problem, busy
+from semdb.service.problems import Problem
 from semdb.service.roles import READ
 from semdb.service.routing import MapName, Table
-from semdb.service.state import Service, read, service_of
+from semdb.service.state import Service, access_of, read, service_of
+from semdb.service.streams import LONGEST_S
 
 table = Table("live")
 EVENT_S = 0.25
@@ -38,35 +38,32 @@ async def follow_live(request: Request, map: MapName) -> Response:
     """The same as server-sent events: `cameras` whenever one of them moved, came or went."""
     service = service_of(request)
     await read(request, lambda db: db.map(map))
-    if service.streams >= MOST_STREAMS:
-        raise busy("too many follow", 10)
+    service.streams.check(access_of(request).who)
     return StreamingResponse(_events(request, service, map), 200, {"X-Accel-Buffering": "no"}, "text/event-stream")
 
 
 async def _events(request: Request, service: Service, map_name: str) -> AsyncIterator[bytes]:
-    service.streams += 1
     try:
-        ends = time.monotonic() + LONGEST_STREAM_S
-        said: Any = None
-        spoke = admitted = time.monotonic()
-        while not service.stopping and time.monotonic() < ends:
-            found = _cameras(service, map_name)
-            news = [(one["camera"], one["frames"]) for one in found["cameras"]]
-            now = time.monotonic()
-            if news != said:
-                said, spoke = news, now
-                yield b"event: cameras\ndata: " + encoded(found) + b"\n\n"
-            elif now - spoke > STILL_S:
-                spoke = now
-                yield b": still\n\n"
-            await asyncio.sleep(EVENT_S)
-            if now - admitted > ADMIT_S:
-                admitted = now
-                await admit(request, READ)  # a token may have been revoked since
+        with service.streams.one(access_of(request).who):
+            ends = time.monotonic() + LONGEST_S
+            said: Any = None
+            spoke = admitted = time.monotonic()
+            while not service.stopping and time.monotonic() < ends:
+                found = _cameras(service, map_name)
+                news = [(one["camera"], one["frames"]) for one in found["cameras"]]
+                now = time.monotonic()
+                if news != said:
+                    said, spoke = news, now
+                    yield b"event: cameras\ndata: " + encoded(found) + b"\n\n"
+                elif now - spoke > STILL_S:
+                    spoke = now
+                    yield b": still\n\n"
+                await asyncio.sleep(EVENT_S)
+                if now - admitted > ADMIT_S:
+                    admitted = now
+                    await admit(request, READ)  # a token may have been revoked since
     except (Problem, SemdbError):  # nothing can be said any more: whoever follows comes again, and is told
         return
-    finally:
-        service.streams -= 1
 
 
 def _cameras(service: Service, map_name: str) -> dict[str, Any]:

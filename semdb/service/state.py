@@ -19,6 +19,7 @@ from semdb.service.metrics import Metrics
 from semdb.service.pool import Pool
 from semdb.service.roles import Access, Rates
 from semdb.service.settings import MIB, ServeSettings
+from semdb.service.streams import Streams
 from semdb.service.uploads import Uploads
 
 T = TypeVar("T")
@@ -64,7 +65,7 @@ class Service:
     metrics: Metrics = field(init=False)
     uploads: Uploads = field(init=False)
     jobs: Jobs | None = None
-    streams: int = 0
+    streams: Streams = field(default_factory=Streams)
     stopping: bool = False
 
     def __post_init__(self) -> None:

@@ -11,6 +11,7 @@ from semdb.service.cameras import Live, Sessions
 from semdb.service.middleware import Doorkeeper, close_reason
 from semdb.service.problems import Problem
 from semdb.service.settings import ServeSettings
+from semdb.service.streams import Streams
 
 
 @pytest.mark.parametrize("origin", [b"http://[", b"http://[::1", b"null", b"http://elsewhere", b"http://127.0.0.1:1"])
@@ -39,3 +40,15 @@ def test_a_request_that_failed_ends_no_camera_but_its_own() -> None:
         return len(sessions)
 
     assert asyncio.run(both()) == 1
+
+
+def test_one_who_follows_much_leaves_places_for_others() -> None:
+    streams = Streams(most=3, most_each=2)
+    with streams.one("a"), streams.one("a"):
+        with pytest.raises(Problem, match="too many follow"):
+            streams.check("a")
+        streams.check("b")
+        with streams.one("b"), pytest.raises(Problem):
+            streams.check("c")
+    streams.check("a")
+    assert len(streams) == 0
