@@ -9,7 +9,7 @@ from typing import Any
 
 from semdb.errors import ModelError, UsageError
 from semdb.perception.catalogue import BY_NAME
-from semdb.perception.model_files import models_dir, resolve_onnx
+from semdb.perception.model_files import models_dir, resolve_file, resolve_onnx
 from semdb.perception.torch_models import resolve_checkpoint
 from semdb.settings import Settings
 from semdb.types import ModelInfo
@@ -56,10 +56,10 @@ def specs_for_ingest(settings: Settings, map_models: Sequence[ModelInfo], *, has
             "this recording brings no object masks, so a detector is needed: set SEMDB_DETECTOR=onnx:FILE "
             "or torchvision:NAME (a Mask R-CNN, see docs/models.md) or pass --detector"
         )
-    if chosen["detector"] == "recorded" and not has_masks:
+    if chosen["detector"].removeprefix("whole-").removeprefix("boxes:") == "recorded" and not has_masks:
         raise UsageError(
-            "the detector is 'recorded', but this recording brings no object masks: set SEMDB_DETECTOR=onnx:FILE or "
-            "pass --detector, and --map where the map holds recordings with masks"
+            f"the detector is {chosen['detector']!r}, but this recording brings no object masks: set "
+            "SEMDB_DETECTOR=onnx:FILE or pass --detector, and --map where the map holds recordings with masks"
         )
     return ModelSpecs(chosen["detector"], chosen["encoder"], chosen["features"], tuple(notes))
 
@@ -141,21 +141,23 @@ _RIGHT: dict[str, Callable[[object], bool]] = {
 }
 
 
-def _spec_of(model: ModelInfo, settings: Settings) -> str:
+def _spec_of(model: ModelInfo, settings: Settings, before: str = "") -> str:
     """The spec that loads `model` here; files are looked for where bare names are."""
     kind, _, name = model.name.partition(":")
     if kind in ("boxes", "whole-boxes"):
-        return f"{kind}:{_spec_of(replace(model, name=name), settings)}"
-    if kind not in ("onnx", "torchvision"):
+        return f"{kind}:{_spec_of(replace(model, name=name), settings, f'{kind}:')}"
+    if kind not in ("onnx", "torchvision", "fasterrcnn", "ssd"):
         return model.name
-    find = resolve_onnx if kind == "onnx" else resolve_checkpoint
     try:
-        path = find(model.name, settings)
+        if kind in ("fasterrcnn", "ssd"):
+            path = resolve_file(model.name, f"{kind}:", "a checkpoint (.pth)", settings)
+        else:
+            path = (resolve_onnx if kind == "onnx" else resolve_checkpoint)(model.name, settings)
     except ModelError as error:
         fetch = f", fetch it with `semdb models pull {name}`" if kind == "torchvision" and name in BY_NAME else ""
         raise UsageError(
             f"the map was described by the {model.role} {model.name} (sha256 {model.sha256[:12]}), which is not at "
-            f"hand: set SEMDB_{model.role.upper()}={kind}:PATH to that file{fetch}, or put it into "
+            f"hand: set SEMDB_{model.role.upper()}={before}{kind}:PATH to that file{fetch}, or put it into "
             f"{models_dir(settings)}"
         ) from error
     return model.name if name in BY_NAME else f"{kind}:{path}"

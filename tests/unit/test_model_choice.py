@@ -39,6 +39,9 @@ def test_masks_that_are_not_there_cannot_be_the_detections(settings: Settings) -
     assert specs_for_ingest(named, (), has_masks=True).detector == "recorded"
     with pytest.raises(UsageError, match="brings no object masks"):
         specs_for_ingest(named, (), has_masks=False)
+    for spec in ("boxes:recorded", "whole-boxes:recorded"):
+        with pytest.raises(UsageError, match=f"the detector is '{spec}', but this recording brings no object masks"):
+            specs_for_ingest(settings.model_copy(update={"detector": spec}), (), has_masks=False)
     rendered = (ModelInfo("detector", "recorded", "", "{}"), *MAP[1:])
     with pytest.raises(UsageError, match="brings no object masks"):
         specs_for_ingest(settings, rendered, has_masks=False)
@@ -61,6 +64,20 @@ def test_a_query_takes_the_maps_models_when_their_files_are_at_hand(settings: Se
     assert (specs.detector, specs.encoder, specs.features) == (f"onnx:{file}", "gist", "sift")
     with pytest.raises(UsageError, match="no keyframe"):
         specs_for_query(settings, ())
+
+
+def test_a_query_finds_detectors_of_boxes(settings: Settings) -> None:
+    file = settings.cache_dir / "models" / "mask.onnx"
+    for name in ("boxes:onnx:mask.onnx", "whole-boxes:onnx:mask.onnx", "ssd:mask.onnx"):
+        of_map = (ModelInfo("detector", name, "ab" * 32, "{}"), *MAP[1:])
+        with pytest.raises(
+            UsageError, match=rf"mask\.onnx .sha256 abab.*SEMDB_DETECTOR={name.rpartition(':')[0]}:PATH"
+        ):
+            specs_for_query(settings, of_map)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.touch()
+        assert specs_for_query(settings, of_map).detector == name.replace("mask.onnx", str(file))
+        file.unlink()
 
 
 def test_the_maps_thresholds_hold_unless_others_are_set(settings: Settings) -> None:
