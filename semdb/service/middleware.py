@@ -162,6 +162,8 @@ class Doorkeeper:
             raise Problem(403, "requests from pages of other places are refused", kind="foreign-origin")
         site = header(scope, b"sec-fetch-site").lower()
         followed = header(scope, b"sec-fetch-mode").lower() == "navigate" and scope.get("method") in _SAFE
+        # a link is followed by someone who sees it; a frame asks unseen, as often as its page likes
+        followed = followed and header(scope, b"sec-fetch-dest").lower() in ("", "document")
         if site in ("cross-site", "same-site") and not followed:
             raise Problem(403, "requests from pages of other places are refused", kind="foreign-origin")
 

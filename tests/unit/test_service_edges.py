@@ -25,6 +25,24 @@ def test_an_origin_that_is_none_or_another_one_is_refused(origin: bytes) -> None
     assert refused.value.status == 403
 
 
+@pytest.mark.parametrize(("dest", "let_in"), [(b"document", True), (b"iframe", False), (b"object", False)])
+def test_a_link_from_elsewhere_is_followed_but_in_no_frame(dest: bytes, let_in: bool) -> None:
+    asked: list[str] = []
+
+    async def app(scope: Any, *_: Any) -> None:
+        asked.append(scope["type"])
+
+    fetched = [(b"sec-fetch-site", b"cross-site"), (b"sec-fetch-mode", b"navigate"), (b"sec-fetch-dest", dest)]
+    scope = {"type": "http", "method": "GET", "headers": [(b"host", b"127.0.0.1:8765"), *fetched]}
+    door = Doorkeeper(app, ServeSettings())
+    if let_in:
+        asyncio.run(door(scope, app, app))  # type: ignore[arg-type]
+    else:
+        with pytest.raises(Problem):
+            asyncio.run(door(scope, app, app))  # type: ignore[arg-type]
+    assert asked == (["http"] if let_in else [])
+
+
 def test_the_reason_of_an_end_fits_whatever_a_map_is_called() -> None:
     reason = close_reason(Problem(403, "this token is not for the map " + "\u0645\u0637\u0628\u062e" * 60 + "\udc80"))
     assert len(reason.encode()) <= 123
