@@ -189,7 +189,7 @@ def models(settings: Settings) -> Iterator[Check]:
         "features": load_features,
     }
     yield from words(settings)
-    yield from matcher(settings)
+    yield from learned(settings)
     for role, load in loaders.items():
         spec = str(getattr(settings, role))
         if spec == "auto":
@@ -202,18 +202,24 @@ def models(settings: Settings) -> Iterator[Check]:
             yield Check("problem", role, str(error))
 
 
-def matcher(settings: Settings) -> Iterator[Check]:
-    """Whether the matcher of learned features can be loaded, where one is named."""
+def learned(settings: Settings) -> Iterator[Check]:
+    """Whether matcher and fallback of features can be loaded, where they are named."""
     from semdb.errors import SemdbError
+    from semdb.perception.features import load_features
     from semdb.perception.matchers import load_matcher
 
-    if settings.matcher is None:
-        return
-    try:
-        load_matcher(settings.matcher, settings)
-        yield Check("ok", "matcher", settings.matcher)
-    except SemdbError as error:
-        yield Check("problem", "matcher", str(error))
+    roles: tuple[tuple[str, str | None, Callable[[str, Settings], object]], ...] = (
+        ("matcher", settings.matcher, load_matcher),
+        ("features fallback", settings.features_fallback, load_features),
+    )
+    for role, spec, load in roles:
+        if spec is None:
+            continue
+        try:
+            load(spec, settings)
+            yield Check("ok", role, spec)
+        except SemdbError as error:
+            yield Check("problem", role, str(error))
 
 
 def words(settings: Settings) -> Iterator[Check]:

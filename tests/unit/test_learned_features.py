@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from semdb.cli.doctor import learned
 from semdb.errors import ModelError, UsageError
 from semdb.localization.images import fallback_of
 from semdb.localization.learned_matching import for_learned, is_learned, match_by
@@ -116,6 +117,12 @@ def test_a_matcher_goes_with_what_it_can_match(tmp_path: Path) -> None:
     found = fallback_of(own, [learned])  # of which the matcher is
     assert found is not None
     assert (found.name, found.matcher) == ("sift", None)
+
+
+def test_doctor_looks_at_matcher_and_fallback() -> None:
+    assert list(learned(SETTINGS)) == []
+    found = list(learned(replace_settings(features_fallback="sift", matcher="onnx:nowhere.onnx")))
+    assert [(one.state, one.what) for one in found] == [("problem", "matcher"), ("ok", "features fallback")]
 
 
 def replace_settings(**changed: str) -> Settings:
