@@ -15,7 +15,8 @@ from semdb.settings import Settings
 _OWN = "alembic_version"  # of the migrations, not of users
 _NO_TABLE = re.compile(
     r"no such table: (?:main\.)?(\w+)|Table '(?:[^'.]*\.)?([^'.]+)' doesn't exist"
-)  # SQLite; servers
+    r"|command denied to user .* for table (?:`[^`]*`\.)?[`']([^`']+)[`']"
+)  # SQLite; servers, and servers of which the reader has rights on what there is alone
 _FILE = (
     "SELECT m.name, c.name FROM sqlite_master m, pragma_table_info(m.name) c WHERE m.type IN ('table', 'view') "
     f"AND m.name NOT LIKE 'sqlite%' AND m.name <> '{_OWN}' ORDER BY m.name, c.cid"
@@ -48,6 +49,7 @@ def ask(settings: Settings, sql: str, *, private: bool = False) -> tuple[tuple[s
             known = tables_and_columns(settings)
         except SemdbError:  # the first error is the one to tell
             raise error from None
-        alike = difflib.get_close_matches(missing.group(1) or missing.group(2), known)
+        name = next(group for group in missing.groups() if group)
+        alike = difflib.get_close_matches(name, known)
         hint = f"alike are {', '.join(alike)}" if alike else "\\d in `semdb sql` lists tables and views"
         raise DatabaseError(f"{error}; {hint}") from error

@@ -29,7 +29,15 @@ from tests.database_samples import fill
 from tests.serving import Served, noise, running
 
 SETTINGS = ServeSettings(max_upload_mb=1.0, max_pixels=1_000_000, body_timeout_s=1.0, sql_time_limit_s=1.0, rate=0)
-IN_ADDRESS = {"recording": "r", "keyframe": "1", "landmark": "1", "session": "none", "job": "1", "upload_id": "0"} | {
+IN_ADDRESS = {
+    "recording": "r",
+    "keyframe": "1",
+    "landmark": "1",
+    "session": "none",
+    "job": "1",
+    "query": "1",
+    "upload_id": "0",
+} | {
     "build": "0",
     "name": "0",
 }

@@ -73,14 +73,14 @@ def test_checkpoints_of_torchvision_are_detectors(tmp_path: Path, spec: str, nam
 
 
 def test_boxes_of_another_detector_forget_its_masks() -> None:
-    labels = np.zeros((10, 12), dtype=np.uint16)
-    labels[2, 3:9] = labels[2:8, 3] = 1  # an angle
+    labels = np.zeros((40, 48), dtype=np.uint16)
+    labels[8:12, 12:36] = labels[8:32, 12:16] = 1  # an angle
     instances = InstanceMasks(labels, {1: "chair"})
-    image = np.zeros((10, 12, 3), dtype=np.uint8)
+    image = np.zeros((40, 48, 3), dtype=np.uint8)
     [exact] = load_detector("recorded", SETTINGS).detect(image, instances)
     whole, deep = (load_detector(f"{kind}:recorded", SETTINGS) for kind in ("whole-boxes", "boxes"))
     [box] = whole.detect(image, instances)
-    assert (exact.mask.sum(), box.mask.sum()) == (11, 36)
+    assert (exact.mask.sum(), box.mask.sum()) == (176, 576)
     assert (whole.info.name, deep.info.name) == ("whole-boxes:recorded", "boxes:recorded")
     assert not whole.boxes_only
     assert deep.boxes_only
