@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from semdb.geometry import so3_log
 from semdb.types import FloatArray
 
 POSITION, ROTATION = slice(0, 3), slice(3, 6)
@@ -32,8 +32,7 @@ class Nees:
 
 def pose_offset(estimate: FloatArray, truth: FloatArray) -> FloatArray:
     """``[6]`` by which `estimate` ``[4, 4]`` is off: metres in the world, then a rotation vector in the world (rad)."""
-    turned = Rotation.from_matrix(estimate[:3, :3] @ truth[:3, :3].T).as_rotvec()
-    return np.concatenate([estimate[:3, 3] - truth[:3, 3], turned])
+    return np.concatenate([estimate[:3, 3] - truth[:3, 3], so3_log(estimate[:3, :3] @ truth[:3, :3].T)])
 
 
 def normalised_error(offset: FloatArray, covariance: FloatArray, part: slice) -> float:

@@ -393,9 +393,9 @@ class Localizer:
         )
 
     def _covariance(self, estimate: PoseEstimate | None) -> FloatArray | None:
-        if estimate is None or not self.options.recorded_errors:
-            return None if estimate is None else estimate.covariance
-        return recorded_covariance(estimate)
+        if estimate is None:
+            return None
+        return recorded_covariance(estimate) if self.options.recorded_errors else estimate.covariance
 
     def _candidates(self, search: Search, inliers: dict[int, int]) -> tuple[Candidate, ...]:
         return tuple(

@@ -90,9 +90,10 @@ def scan_all(closeness: Any, nearest: Any, best: Any, second: Any, best_back: An
 
 
 @kernel
-def scan(closeness: Any, rows: Any, columns: Any, nearest: Any, best: Any, second: Any, best_back: Any) -> None:
-    """`scan_all` of some `rows` and `columns`; indexes in `nearest` count `columns`."""
-    least = np.float32(-1.0e38)
+def _scan_from(
+    least: Any, closeness: Any, rows: Any, columns: Any, nearest: Any, best: Any, second: Any, best_back: Any
+) -> None:
+    """`scan` of numbers of the type of `least`, which is less than any of them."""
     best_back[:] = least
     for i in range(len(rows)):
         first, following, at = least, least, 0
@@ -105,6 +106,12 @@ def scan(closeness: Any, rows: Any, columns: Any, nearest: Any, best: Any, secon
                 else:
                     following = value
         nearest[i], best[i], second[i] = at, first, following
+
+
+@kernel
+def scan(closeness: Any, rows: Any, columns: Any, nearest: Any, best: Any, second: Any, best_back: Any) -> None:
+    """`scan_all` of some `rows` and `columns`; indexes in `nearest` count `columns`."""
+    _scan_from(np.float32(-1.0e38), closeness, rows, columns, nearest, best, second, best_back)
 
 
 @kernel
@@ -237,19 +244,7 @@ def _following(line: Any, greatest: Any) -> Any:
 @kernel
 def scan_some_bytes(closeness: Any, rows: Any, columns: Any, nearest: Any, best: Any, second: Any, back: Any) -> None:
     """`scan` of int16 products; without a second it is -32768."""
-    least = np.int16(-32768)
-    back[:] = least
-    for i in range(len(rows)):
-        first, following, at = least, least, 0
-        for j in range(len(columns)):
-            value = closeness[rows[i], columns[j]]
-            back[j] = max(back[j], value)
-            if value > following:
-                if value > first:
-                    following, first, at = first, value, j
-                else:
-                    following = value
-        nearest[i], best[i], second[i] = at, first, following
+    _scan_from(np.int16(-32768), closeness, rows, columns, nearest, best, second, back)
 
 
 @kernel

@@ -204,9 +204,9 @@ def estimate_pose(
     return replace(estimate, aligned=aligned, recorded_sigma=recorded, seen=Alignment(seen.xy[keep], seen.found[keep]))
 
 
-def recorded_covariance(estimate: PoseEstimate | None) -> FloatArray | None:
+def recorded_covariance(estimate: PoseEstimate) -> FloatArray | None:
     """``[6, 6]`` of the pose in the frame of the recorded poses: what images leave open, and how far these are off."""
-    if estimate is None or estimate.covariance is None:
+    if estimate.covariance is None:
         return None
     return estimate.covariance + np.diag(np.repeat(estimate.recorded_sigma, 3) ** 2)
 
