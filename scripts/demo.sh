@@ -41,6 +41,8 @@ others = [line.rstrip("\n") for index, line in enumerate(sys.stdin) if index not
 count = int(sys.argv[1])
 print(*(others[(2 * i + 1) * len(others) // (2 * count)] for i in range(count)), sep="\n")' "$shown" "${stored[@]}")
 step localize "${images[@]}" --map room --like "$out/room" --plot "$out/localize"
+mkdir "$out/photos"
+cp "${images[@]}" "$out/photos" # to drop on the page of make serve
 
 step evaluate "$out/room" --keyframes "$keyframes" --max-queries "$queries" \
   --json "$out/evaluation.json" --report "$out/report"

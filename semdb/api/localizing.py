@@ -234,6 +234,7 @@ class Localizing(Base):
         from semdb.localization.acceptance import as_tolerance
         from semdb.localization.open_maps import ask
         from semdb.localization.query_image import QueryReader
+        from semdb.localization.unmasked import said_of
         from semdb.recordings.arrays import as_camera
 
         tolerance = None if accept is None else as_tolerance(accept)
@@ -249,6 +250,7 @@ class Localizing(Base):
             paths=paths,
             say=self._say,
         )
+        told: set[str] = set()
         for number, read in enumerate(items):
             started = time.perf_counter()
             try:
@@ -261,6 +263,10 @@ class Localizing(Base):
             decode_ms = (time.perf_counter() - started) * 1000
             maps = open_maps.asked(map, coarse) if number else maps  # as they are now
             found = ask(maps, query, lambda entry: open_maps.cameras([entry]), self._say, tolerance)
+            line = said_of(found.localization.map_name)
+            if found.unmasked and line not in told:
+                told.add(line)
+                self._say(line)
             timing = {"decode": decode_ms, **found.description.timing_ms, **found.localization.timing_ms}
             timing["total"] = (time.perf_counter() - started) * 1000
             found = replace(found, localization=replace(found.localization, timing_ms=timing))

@@ -79,8 +79,13 @@ class MapTracker:
         view = view_of(entry, query)
 
         def relocalize() -> Localization:
-            described = entry.describer.describe(query.image, query.depth, query.camera, query.instances)
-            return entry.localizer.localize(described)
+            from semdb.localization.unmasked import describe_query, lacks_masks, said_of, with_reason
+
+            localized = entry.localizer.localize(describe_query(entry.describer, query))
+            if not lacks_masks(entry.describer, query):
+                return localized
+            self._reader.tell(said_of(self.map))
+            return with_reason(localized)
 
         try:
             found = self._tracker.update(view, time_s, relocalize, _checked(odometry))

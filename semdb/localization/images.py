@@ -26,11 +26,12 @@ COARSE = ("sql", "index")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageLocalization:
-    """A localized image with what pictures need."""
+    """A localized image with what pictures need. `unmasked`: nothing was filtered by class (see `unmasked.py`)."""
 
     query: QueryImage
     description: Description
     localization: Localization
+    unmasked: bool = False
 
 
 def check_coarse(coarse: str) -> None:

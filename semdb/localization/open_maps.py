@@ -18,6 +18,7 @@ from semdb.localization.query_image import QueryImage, at_scale
 from semdb.localization.query_scale import times_finer
 from semdb.localization.shared import SharedSource
 from semdb.localization.sources import SqlSource
+from semdb.localization.unmasked import describe_query, lacks_masks, with_reason
 from semdb.names import storable
 from semdb.perception.describe import Describer, describer_from_specs
 from semdb.perception.model_choice import settings_of_map, specs_for_query
@@ -186,29 +187,33 @@ def ask(
     out and told to `say` where another one answers. Raises FrameError, ModelError, DatabaseError.
     """
     described: dict[tuple[Describer, Camera], Description] = {}
-    answers: list[tuple[QueryImage, Description, Localization]] = []
+    answers: list[tuple[QueryImage, Description, Localization, bool]] = []
     refused: list[CodecError] = []
     for entry in maps:
         known = cameras(entry) if cameras is not None and len(maps) > 1 else ()
         scaled = at_scale(query, times_finer(query.camera, known))
         key = entry.describer, scaled.camera
         if key not in described:
-            described[key] = entry.describer.describe(scaled.image, scaled.depth, scaled.camera, scaled.instances)
+            described[key] = describe_query(entry.describer, scaled)
         try:
-            answers.append((scaled, described[key], entry.localizer.localize(described[key], accept)))
+            found = entry.localizer.localize(described[key], accept)
         except CodecError as error:
             refused.append(error)
             if say is not None and len(maps) > 1:
                 say(f"map {entry.head.name!r} does not answer: {error}")
+        else:
+            unmasked = lacks_masks(entry.describer, scaled)
+            answers.append((scaled, described[key], with_reason(found) if unmasked else found, unmasked))
     if not answers:
         raise refused[0]
     order = {Verdict.LOCALIZED: 3, Verdict.AMBIGUOUS: 2, Verdict.COARSE: 1, Verdict.FAILED: 0}
     answers.sort(key=lambda answer: (order[answer[2].verdict], answer[2].inliers), reverse=True)
-    query, description, best = answers[0]
+    query, description, best, unmasked = answers[0]
     limit = maps[0].localizer.options.verdict.rival_share * best.inliers
-    rivals = [other for _, _, other in answers[1:] if other.verdict is Verdict.LOCALIZED and other.inliers > limit]
+    rivals = [other for _, _, other, _ in answers[1:] if other.verdict is Verdict.LOCALIZED and other.inliers > limit]
     if best.verdict is Verdict.LOCALIZED and rivals:
         reason = f"map {rivals[0].map_name!r} fits as well: {rivals[0].inliers} against {best.inliers} inliers"
         confidence = min(best.confidence, RIVAL_CONFIDENCE)
         best = replace(best, verdict=Verdict.AMBIGUOUS, confidence=confidence, reason=reason)
-    return ImageLocalization(query, description, best)
+        best = with_reason(best) if unmasked else best
+    return ImageLocalization(query, description, best, unmasked)

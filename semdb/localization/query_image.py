@@ -129,7 +129,7 @@ class QueryReader:
 
     def _of_file(self, path: Path, depth: Depth | None) -> QueryImage:
         data = read_bytes(path)
-        found = self._on_disk.around(path, self._paths, self._tell)
+        found = self._on_disk.around(path, self._paths, self.tell)
         return self._of_bytes(data, str(path), depth, found, _IN_FILES)
 
     def _of_bytes(
@@ -145,9 +145,9 @@ class QueryReader:
             pose, index, time = entry.world_from_camera, entry.index, entry.timestamp_ns
             instances = recording.read_instances(entry)
         if header.bits == 16 and header.channels == 1:
-            self._tell(f"{name} has one channel of 16 bits, as depth images have; it is taken for a grey image")
+            self.tell(f"{name} has one channel of 16 bits, as depth images have; it is taken for a grey image")
         if orientation_of(data) > 1:
-            self._tell(
+            self.tell(
                 f"{name} has an orientation mark, which is not applied: intrinsics belong to the pixels as stored"
             )
         reduction = reduction_of(times_finer(camera, self._map_cameras())) if header.kind == "jpeg" else 1
@@ -189,13 +189,13 @@ class QueryReader:
         times = times_finer(original, self._map_cameras())
         found = at_scale(query, times * math.sqrt(query.camera.fx * query.camera.fy / (original.fx * original.fy)))
         if times > 1:
-            self._tell(
+            self.tell(
                 f"{query.name} ({original.width}x{original.height}) is localized at {found.camera.width}x"
                 f"{found.camera.height}, the scale of the map's images"
             )
         remarks = [remark_on_color(found.image), None if found.depth is None else remark_on_depth(found.depth)]
         for remark in filter(None, remarks):
-            self._tell(f"{query.name}: {remark}")
+            self.tell(f"{query.name}: {remark}")
         return found
 
     def _map_cameras(self) -> Sequence[Camera]:
@@ -208,7 +208,7 @@ class QueryReader:
         if problem is not None:
             raise FrameError(f"{name}: its camera makes no sense: {problem}")
         for doubt in camera_doubts(camera):
-            self._tell(f"camera of {name}: {doubt}")
+            self.tell(f"camera of {name}: {doubt}")
 
     def _read_depth(
         self, depth: Depth | None, name: str, size: tuple[int, int], scale: float | None
@@ -247,14 +247,14 @@ class QueryReader:
             _check_size(self._like.camera, size, name, self._like.origin)
             return self._like.camera, scale
         if found is not None:
-            self._tell(f"camera of the images: that of the recording {found[0].path} they belong to")
+            self.tell(f"camera of the images: that of the recording {found[0].path} they belong to")
             self._tell_assumed(str(found[0].path), found[0].assumed)
             own = found[0].camera_of(found[1])
             _check_size(own, size, name, str(found[0].path))
             return own, scale
         fitting = {camera for camera in self._map_cameras() if (camera.width, camera.height) == size}
         if len(fitting) == 1:
-            self._tell("camera of the images: that of the map's keyframes (--camera or --like name another)")
+            self.tell("camera of the images: that of the map's keyframes (--camera or --like name another)")
             return fitting.pop(), scale
         if self._nominal:
             return Camera(*size, size[0], size[0], (size[0] - 1) / 2, (size[1] - 1) / 2), scale
@@ -285,9 +285,10 @@ class QueryReader:
     def _tell_assumed(self, origin: str, assumed: Sequence[str]) -> None:
         for line in assumed:
             if not line.startswith("poses"):  # which are only drawn
-                self._tell(f"{origin}: {line}")
+                self.tell(f"{origin}: {line}")
 
-    def _tell(self, line: str) -> None:
+    def tell(self, line: str) -> None:
+        """Says a line to whoever asks, once."""
         if line not in self._said:
             self._said.add(line)
             self._say(line)

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from semdb import open as semdb_open
 from semdb.geometry import pose_error, pose_from, rotation_from_quat_wxyz
 from semdb.ingestion.run import IngestOptions, ingest_recordings
 from semdb.recordings import open_recording
@@ -318,3 +319,30 @@ def test_evaluate_on_a_server_gives_the_same_figures_and_leaves_nothing(
         schemas = connection.execute(text("SHOW DATABASES LIKE 'semdb_evaluate%'")).all()
     engine.dispose()
     assert schemas == []
+
+
+def test_photos_without_masks_are_localized_and_it_is_said(
+    room: Path, url: str, images: list[Path], tmp_path: Path
+) -> None:
+    """Copies of frames outside their recording, in a map whose objects are recorded masks."""
+    photos = [Path(shutil.copy(image, tmp_path / f"photo-{image.name}")) for image in (images[4], images[13])]
+    done = semdb("localize", *photos, "--json", url=url)
+    assert done.returncode == 0, done.stderr
+    for answer, image in zip(json.loads(done.stdout), (images[4], images[13]), strict=True):
+        assert (answer["verdict"], answer["stage"], answer["ranked_share"]) == ("localized", "all", 1.0)
+        assert answer["reason"].endswith("; the image has no masks of its own: nothing is filtered by class")
+        pose = pose_from(rotation_from_quat_wxyz(answer["pose"]["quat_wxyz"]), answer["pose"]["position"])
+        metres, degrees = pose_error(pose, true_pose(room, image))
+        assert metres < 0.02
+        assert degrees < 0.5
+    assert done.stderr.count("an image without masks is localized without objects") == 1
+
+
+def test_a_camera_without_masks_is_tracked(room: Path, url: str, images: list[Path], tmp_path: Path) -> None:
+    said: list[str] = []
+    with semdb_open(url, threads=1, say=said.append) as database:
+        tracker = database.tracker("room")
+        found = [tracker.update(image.read_bytes(), time_s=0.1 * k) for k, image in enumerate(images[4:6])]
+    assert "nothing is filtered by class" in found[0].reason
+    assert [one.world_from_camera is not None for one in found] == [True, True]
+    assert sum("without masks" in line for line in said) == 1

@@ -104,14 +104,19 @@ def test_a_folder_that_is_chosen_is_localized_photo_by_photo(visit: Visit, recor
     page.wait_for_selector(".result-list li:nth-child(6) .result[aria-current]")
 
 
-def test_a_photo_that_is_dropped_anywhere_says_what_it_needs(visit: Visit, recording: Path) -> None:
+def test_a_photo_that_is_dropped_anywhere_is_localized_without_masks(visit: Visit, recording: Path) -> None:
     photo = sorted((recording / "rgb").iterdir())[2].read_bytes()
-    visit.expected.append("422")
     visit.go("/maps/office/queries")
     dropped(visit, {"photo.png": photo})
     visit.page.wait_for_url("**/maps/office/locate")
-    visit.page.wait_for_selector("text=drop the folder of such a recording")
-    visit.shot("locate-needs-masks")
+    visit.page.wait_for_selector("text=1 of 1 localized")
+    visit.page.wait_for_selector("figure.matches svg path")
+    told = visit.page.inner_text(".result-detail")
+    assert "the image has no masks of its own: nothing is filtered by class" in told
+    assert "localized without objects" in told
+    place = [float(part) for part in visit.page.inner_text(".facts dd >> nth=0").split(",")]
+    assert np.abs(np.array(place) - np.loadtxt(recording / "groundtruth.txt")[2, 1:4]).max() < 0.05
+    visit.shot("locate-photo")
     dropped(visit, {"notes.txt": b"no photo"})
     visit.page.wait_for_selector("text=There is no PNG or JPEG photo in that.")
 

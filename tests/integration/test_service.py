@@ -93,7 +93,11 @@ def test_depth_and_several_images(served: Served, frames: list[Frame]) -> None:
     wanted = served.database.localize(frames[7], map="office", name="frame")
     assert untimed(found) == untimed(as_sent(wanted))
     answer = served.client.post("/v1/maps/office/localize", files={"image": files["image"]})
-    assert "brings no masks" in answer.json()["detail"]  # a map of masks that images do not bring
+    unmasked = answer.json()  # a map of masks that images do not bring
+    assert (unmasked["verdict"], unmasked["stage"], unmasked["objects"]) == ("localized", "all", [])
+    assert unmasked["reason"].endswith("the image has no masks of its own: nothing is filtered by class")
+    assert any("an image without masks is localized without objects" in note for note in unmasked["notes"])
+    assert np.abs(np.array(unmasked["pose"]["position"]) - frames[7].world_from_camera[:3, 3]).max() < 0.02
 
 
 def test_several_images(served: Served, frames: list[Frame]) -> None:

@@ -282,7 +282,6 @@ export const texts = {
     here: "here",
     assumed: "What was assumed",
     lookFromThere: "Look at the map from there",
-    needsMasks: "This map was made from masks that its recording brings, so photos need masks, too: drop the folder of such a recording (rgb/ with masks/), or ingest the map with a detector: SEMDB_DETECTOR=onnx:FILE.",
     needsCamera: "Say above which camera took them: that of a recording, or its numbers fx,fy,cx,cy.",
   },
   sql: {

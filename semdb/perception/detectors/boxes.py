@@ -94,6 +94,7 @@ class BoxesOf:
         self._detector = detector
         self.classes = detector.classes
         self.boxes_only = by_depth
+        self.needs_masks: bool = getattr(detector, "needs_masks", False)
         kind = "boxes" if by_depth else "whole-boxes"
         info = detector.info
         self.info = ModelInfo("detector", f"{kind}:{info.name}", info.sha256, info.config)

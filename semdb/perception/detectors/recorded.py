@@ -16,6 +16,7 @@ class RecordedDetector:
     """One detection, with score 1, for every instance label that covers at least `MIN_PIXELS` pixels."""
 
     classes: tuple[str, ...] | None = None  # each recording has its own
+    needs_masks = True
 
     def __init__(self) -> None:
         self.info = ModelInfo("detector", "recorded", "", canonical_json({"min_pixels": MIN_PIXELS}))

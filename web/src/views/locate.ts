@@ -198,7 +198,6 @@ class Locating {
   private refusal(error: unknown): HTMLElement {
     const shown = failed(error, () => this.last && void this.take(this.last));
     const detail = error instanceof Error ? error.message : "";
-    if (/masks|recorded/.test(detail)) shown.append(h("p", null, texts.locate.needsMasks));
     if (/camera/.test(detail)) shown.append(h("p", null, texts.locate.needsCamera));
     return shown;
   }
