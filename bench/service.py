@@ -29,7 +29,6 @@ import numpy as np
 
 import semdb
 from semdb.recordings import open_recording
-from semdb.recordings.images import decode_color
 from semdb.service.instances import frame_with
 from semdb.types import Frame
 
@@ -73,53 +72,46 @@ def form_of(frame: Frame) -> tuple[dict[str, str], dict[str, Any]]:
     return form, files
 
 
-def decode(form: dict[str, str], files: dict[str, Any]) -> None:
-    """What of a form becomes arrays: the library decodes as much where it is asked with files."""
-    if "instances" in files:
-        frame_with(
-            *(files["image"][1], None, files["instances"][1], form["categories"]),
-            camera=form["camera"],
-            depth_scale=None,
-            name="image",
-        )
-    else:
-        decode_color(files["image"][1], "image")
+def ask_library(database: Any, form: dict[str, str], files: dict[str, Any]) -> Any:
+    """What the service does with a form: the same files are decoded, and the same is asked."""
+    image = files["image"][1]
+    if "instances" not in files:
+        return database.localize(image, map="bench", camera=form["camera"], name="image", log=False)
+    given = (image, None, files["instances"][1], form["categories"])
+    frame = frame_with(*given, camera=form["camera"], depth_scale=None, name="image")
+    return database.localize(frame, map="bench", name="image", log=False)
 
 
 def in_turn(database: Any, client: httpx.Client, pid: int, frames: list[Frame], queries: int) -> dict[str, float]:
-    """Milliseconds of the library here, of the service, and of what the service takes beside the library there.
+    """Milliseconds of the library here, of the service, and of what HTTP costs, each query by both in turn.
 
-    The library gets arrays, so decoding the files counts for the service; `http` is without what decoding takes here.
+    Both get the same bytes. `overhead` is how long a client waits less what the library took there for the same
+    request (Server-Timing); `difference` is the service less the library here, whose own times vary by more than that.
     Also of processor time, which other programs on the machine do not change much.
     """
-    library, service, beside, http = [], [], [], []
-    here, decoding, there = 0.0, 0.0, 0.0
+    library, service, overhead = [], [], []
+    here, there = 0.0, 0.0
     for number in range(queries + 3):
-        frame = replace(frames[number % len(frames)], depth=None)
-        form, files = form_of(frame)
-        if number == 3:
-            here, decoding, there = 0.0, 0.0, cpu_ms(pid)
-        own = time.process_time()
-        started = time.perf_counter()
-        decode(form, files)
-        decode_ms = 1000 * (time.perf_counter() - started)
-        decoding += 1000 * (time.process_time() - own)
-        own = time.process_time()
-        started = time.perf_counter()
-        database.localize(frame, map="bench", log=False)
+        form, files = form_of(replace(frames[number % len(frames)], depth=None))
+        if number == 3:  # what is loaded at first is not counted
+            library, service, overhead, here, there = [], [], [], 0.0, cpu_ms(pid)
+        own, started = time.process_time(), time.perf_counter()
+        wanted = ask_library(database, form, files)
         here += 1000 * (time.process_time() - own)
         between = time.perf_counter()
         answer = client.post("/v1/maps/bench/localize", data=form, files=files)
         ended = time.perf_counter()
         answer.raise_for_status()
-        if number >= 3:  # what is loaded at first is not counted
-            library.append(1000 * (between - started))
-            service.append(1000 * (ended - between))
-            beside.append(service[-1] - answer.json()["timing_ms"]["total"])
-            http.append(beside[-1] - decode_ms)
-    found = {"library_cpu_ms": here / queries, "decoding_cpu_ms": decoding / queries}
-    found["service_cpu_ms"] = (cpu_ms(pid) - there) / queries
-    for name, values in (("library", library), ("service", service), ("overhead", beside), ("http", http)):
+        pose = wanted.world_from_camera
+        if answer.json()["world_from_camera"] != (None if pose is None else pose.tolist()):
+            raise SystemExit(f"query {number}: the service answers otherwise than the library")
+        library.append(1000 * (between - started))
+        service.append(1000 * (ended - between))
+        overhead.append(service[-1] - float(answer.headers["Server-Timing"].rpartition("=")[2]))
+    found = {"library_cpu_ms": here / queries, "service_cpu_ms": (cpu_ms(pid) - there) / queries}
+    difference = [theirs - ours for theirs, ours in zip(service, library, strict=True)]
+    of_each = {"library": library, "service": service, "difference": difference, "overhead": overhead}
+    for name, values in of_each.items():
         found[f"{name}_p50_ms"], found[f"{name}_p95_ms"] = (float(np.percentile(values, q)) for q in (50, 95))
     return found
 

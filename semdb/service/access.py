@@ -6,10 +6,11 @@ from collections.abc import Callable, Coroutine
 from typing import Any
 
 from fastapi.routing import APIRoute
-from starlette.requests import HTTPConnection, Request
+from starlette.requests import ClientDisconnect, HTTPConnection, Request
 from starlette.responses import Response
 
 from semdb.door.access import AccessToken
+from semdb.service.forms import read_form
 from semdb.service.middleware import check_depth
 from semdb.service.problems import Problem
 from semdb.service.roles import ADMIN, ON_LOOPBACK, PUBLIC, SLASH, Access
@@ -79,8 +80,22 @@ class GuardedRoute(APIRoute):
             names.update({key: value.replace(SLASH, "/") for key, value in names.items()})
             if role != PUBLIC:
                 await admit(request, role)
-            if request.headers.get("content-type", "").lower().startswith("application/json"):
-                check_depth(await request.body())
-            return await handler(request)
+            kind = request.headers.get("content-type", "").lower()
+            if kind.startswith("application/json"):
+                check_depth(await _body(request))
+            if not kind.startswith("multipart/form-data"):
+                return await handler(request)
+            service: Service = request.app.state.service
+            with service.forms.room_for(request) as there_is_room:
+                if there_is_room:
+                    read_form(request, await _body(request))
+                return await handler(request)
 
         return guarded
+
+
+async def _body(request: Request) -> bytes:
+    try:
+        return await request.body()
+    except ClientDisconnect:
+        raise Problem(499, "the client went away") from None

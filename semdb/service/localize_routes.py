@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -112,13 +113,13 @@ Files = Annotated[Given, Depends(files_of)]
 @table.route("POST", "/v1/maps/{map}/localize", LOCALIZE, schemas.Answer, errors=_ERRORS)
 async def localize_in_map(request: Request, map: MapName, query: Asked, given: Files, name: Name = None) -> Response:
     """Where an image was taken, in one map. Every verdict is an answer: `failed` is 200, too."""
-    return as_json(await answered(request, query, given, name))
+    return timed(*await answered(request, query, given, name))
 
 
 @table.route("POST", "/v1/localize", LOCALIZE, schemas.Answer, errors=_ERRORS)
 async def localize(request: Request, query: Asked, given: Files, name: Name = None) -> Response:
     """Where an image was taken, in any map that the token is for."""
-    return as_json(await answered(request, query, given, name))
+    return timed(*await answered(request, query, given, name))
 
 
 @table.route("POST", "/v1/maps/{map}/localize/batch", LOCALIZE, schemas.Batch, errors=_ERRORS)
@@ -147,7 +148,7 @@ async def localize_batch(
         called = name[number] if name else f"image {number}"
         try:
             own = await _bytes(depth[number]) if depth else None
-            answer = await answered(request, query, Given(await file.read(), own), called, watch=False)
+            answer, _ = await answered(request, query, Given(await file.read(), own), called, watch=False)
             items.append({"answer": answer, "problem": None})
         except FrameError as error:
             told = problem_of(error).as_dict(request.state.request_id)
@@ -159,16 +160,23 @@ async def _bytes(file: UploadFile | None) -> bytes | None:
     return None if file is None else await file.read() or None
 
 
+def timed(content: dict[str, Any], library_ms: float) -> Response:
+    """An answer that says what of its time is the library's: all else is HTTP, and waiting for a turn."""
+    return as_json(content, headers={"Server-Timing": f"library;dur={library_ms:.3f}"})
+
+
 async def answered(
     request: Request, query: Query, given: Given, name: str | None, *, watch: bool = True
-) -> dict[str, Any]:
-    """The answer for one image. Raises Problem, SemdbError."""
+) -> tuple[dict[str, Any], float]:
+    """The answer for one image, and the milliseconds that the library took. Raises Problem, SemdbError."""
     service, access = service_of(request), access_of(request)
     watching = (lambda: gone(request)) if watch else None
     return await service.localizing.run(work_of(service, access, query, given, name or "image"), watching)
 
 
-def work_of(service: Service, access: Access, query: Query, given: Given, name: str) -> Callable[[], dict[str, Any]]:
+def work_of(
+    service: Service, access: Access, query: Query, given: Given, name: str
+) -> Callable[[], tuple[dict[str, Any], float]]:
     """What a thread of the pool does for one image."""
     for what, data in (("image", given.image), ("depth image", given.depth), ("image of instances", given.instances)):
         if data is not None:
@@ -200,12 +208,14 @@ def work_of(service: Service, access: Access, query: Query, given: Given, name: 
             log=query.log,
         )
 
-    def work() -> dict[str, Any]:
+    def work() -> tuple[dict[str, Any], float]:
+        started = time.perf_counter()
         answer, notes = with_notes(ask)
+        taken_ms = 1000 * (time.perf_counter() - started)
         service.answered(str(answer.verdict))
         own = {"frame_index": query.frame_index, "timestamp_ns": query.timestamp_ns}
         told = answer_dict(answer, masks=query.masks, notes=[scrubbed(line) for line in notes])
-        return told | own | ({"matches": matches_dict(answer)} if query.matches else {})
+        return told | own | ({"matches": matches_dict(answer)} if query.matches else {}), taken_ms
 
     return work
 

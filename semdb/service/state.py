@@ -14,6 +14,7 @@ from starlette.websockets import WebSocket
 
 from semdb.api import Database
 from semdb.service.cameras import Sessions
+from semdb.service.forms import Memory
 from semdb.service.ingesting import Jobs, ingest_settings
 from semdb.service.metrics import Metrics
 from semdb.service.pool import Pool
@@ -66,6 +67,7 @@ class Service:
     uploads: Uploads = field(init=False)
     jobs: Jobs | None = None
     streams: Streams = field(default_factory=Streams)
+    forms: Memory = field(default_factory=Memory)
     stopping: bool = False
 
     def __post_init__(self) -> None:
