@@ -14,8 +14,8 @@ from scipy.stats import chi2
 from bench.trust.suites import HARD, NEGATIVE, POSITIVE, TEST, Asked, Query
 from semdb.evaluation.calibration import auroc, expected_calibration_error
 from semdb.evaluation.metrics import FALSE_ROTATION_DEG, FALSE_TRANSLATION_M
-from semdb.evaluation.uncertainty import POSITION, ROTATION, normalised_error, pose_offset
-from semdb.geometry import pose_error
+from semdb.evaluation.uncertainty import POSITION, ROTATION, normalised_error
+from semdb.geometry import pose_error, pose_offset
 from semdb.localization.confidence import Evidence
 from semdb.localization.verdict import VerdictOptions, judge
 from semdb.types import FloatArray, Localization, Verdict

@@ -24,7 +24,7 @@ if TYPE_CHECKING:  # the rooms behind are entered when something is asked of the
     from semdb.recordings.arrays import CameraLike
     from semdb.recordings.base import Recording
     from semdb.recordings.options import ReadOptions
-    from semdb.refinement.align import AlignReport
+    from semdb.refinement.align_report import AlignReport
     from semdb.refinement.run import StepResult
 
 

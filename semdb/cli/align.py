@@ -13,7 +13,7 @@ from semdb.shown import for_shell, measure
 
 if TYPE_CHECKING:
     from semdb.api import Database
-    from semdb.refinement.align import AlignedKeyframe, AlignReport
+    from semdb.refinement.align_report import AlignedKeyframe, AlignReport
 
 COLUMNS = (
     *("keyframe", "frame", "verdict", "agrees", "inliers"),

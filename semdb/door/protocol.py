@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from semdb.recordings.arrays import CameraLike
     from semdb.recordings.base import Recording
     from semdb.recordings.options import ReadOptions
-    from semdb.refinement.align import AlignReport
+    from semdb.refinement.align_report import AlignReport
     from semdb.refinement.run import StepResult
     from semdb.trajectory.recording import RecordedTrajectory
     from semdb.types import FloatArray, Frame, ModelInfo

@@ -14,8 +14,8 @@ import numpy as np
 
 from semdb.evaluation.refined_truth import Disagreement
 from semdb.evaluation.retrieval import Reach, Retrieval, retrieval_figures
-from semdb.evaluation.uncertainty import POSITION, ROTATION, Nees, nees_figures, normalised_error, pose_offset
-from semdb.geometry import pose_error
+from semdb.evaluation.uncertainty import POSITION, ROTATION, Nees, nees_figures, normalised_error
+from semdb.geometry import pose_error, pose_offset
 from semdb.types import FloatArray, Localization, ModelInfo, Verdict
 
 FALSE_TRANSLATION_M = 0.25

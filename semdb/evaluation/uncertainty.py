@@ -1,6 +1,7 @@
 """Is a covariance true? Errors over what it says of them, position and rotation apart.
 
-The error of a pose is (position in the world, rotation vector in the world), as its covariance is.
+The error of a pose is (position in the world, rotation vector in the world), as its covariance is:
+`geometry.pose_offset`.
 """
 
 from __future__ import annotations
@@ -11,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from semdb.geometry import so3_log
 from semdb.types import FloatArray
 
 POSITION, ROTATION = slice(0, 3), slice(3, 6)
@@ -28,11 +28,6 @@ class Nees:
     rotation: float
     inside_50: float
     inside_95: float
-
-
-def pose_offset(estimate: FloatArray, truth: FloatArray) -> FloatArray:
-    """``[6]`` by which `estimate` ``[4, 4]`` is off: metres in the world, then a rotation vector in the world (rad)."""
-    return np.concatenate([estimate[:3, 3] - truth[:3, 3], so3_log(estimate[:3, :3] @ truth[:3, :3].T)])
 
 
 def normalised_error(offset: FloatArray, covariance: FloatArray, part: slice) -> float:

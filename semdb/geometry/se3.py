@@ -139,6 +139,11 @@ def pose_error(estimate: FloatArray, truth: FloatArray) -> tuple[float, float]:
     return distance, rotation_angle_deg(estimate[:3, :3].T @ truth[:3, :3])
 
 
+def pose_offset(pose: FloatArray, other: FloatArray) -> FloatArray:
+    """What moves `other` to `pose`, both ``[4, 4]``: ``[6]``, metres in the world, then a rotation vector (rad)."""
+    return np.concatenate([pose[:3, 3] - other[:3, 3], so3_log(pose[:3, :3] @ other[:3, :3].T)])
+
+
 def pose_distances(pose: FloatArray, poses: FloatArray) -> FloatArray:
     """How far `poses` ``[n, 4, 4]`` are from `pose` ``[4, 4]``, ``[n]``: metres / 0.3 plus degrees / 15, no unit."""
     metres = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1)

@@ -37,7 +37,7 @@ from semdb.settings import Settings
 from semdb.types import ModelInfo
 
 if TYPE_CHECKING:
-    from semdb.refinement.align import AlignReport
+    from semdb.refinement.align_report import AlignReport
 
 Progress = Callable[[str, int, int], None]  # what, done, total
 Describers = dict[object, list[Describer]]  # by all that makes them what they are

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from semdb.geometry import invert_pose, pose_error, so3_log
+from semdb.geometry import invert_pose, pose_error, pose_offset
 from semdb.localization.confidence import Evidence, confidence_of, sigmas
 from semdb.localization.matching import Matches
 from semdb.localization.pairs import join_pairs, reprojection_px, world_points_of
@@ -243,8 +243,7 @@ def fused(
     """Two independent estimates of one pose in one, each ``[4, 4]`` with its ``[6, 6]``."""
     one, two = np.linalg.inv(laid_covariance), np.linalg.inv(other_covariance)
     covariance = np.linalg.inv(one + two)
-    offset = np.concatenate([other[:3, 3] - laid[:3, 3], so3_log(other[:3, :3] @ laid[:3, :3].T)])
-    step = covariance @ two @ offset
+    step = covariance @ two @ pose_offset(other, laid)
     return moved(laid, step), covariance
 
 

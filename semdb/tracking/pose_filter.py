@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semdb.geometry import POSE_UNIT_DEG, POSE_UNIT_M, pose_from, project_to_so3, skew, so3_exp, so3_log
+from semdb.geometry import POSE_UNIT_DEG, POSE_UNIT_M, pose_from, pose_offset, project_to_so3, skew, so3_exp, so3_log
 from semdb.tracking.options import MotionOptions
 from semdb.types import FloatArray
 
@@ -80,19 +80,14 @@ def way(motion: FloatArray) -> float:
     return float(np.linalg.norm(motion[:3, 3]) / POSE_UNIT_M + turn / POSE_UNIT_DEG)
 
 
-def difference(pose: FloatArray, other: FloatArray) -> FloatArray:
-    """What moves `other` to `pose` ``[6]``: translation in the world, left rotation."""
-    return np.concatenate([pose[:3, 3] - other[:3, 3], so3_log(pose[:3, :3] @ other[:3, :3].T)])
-
-
 def shifted(pose: FloatArray, error: FloatArray) -> FloatArray:
-    """`pose` moved by ``[6]``, the inverse of `difference`."""
+    """`pose` moved by ``[6]``, the inverse of `pose_offset`."""
     return pose_from(project_to_so3(so3_exp(error[3:]) @ pose[:3, :3]), pose[:3, 3] + error[:3])
 
 
 def surprise(state: FilterState, pose: FloatArray, covariance: FloatArray) -> float:
     """Squared distance, in standard deviations, of a measured pose from where it is expected: chi-square of six."""
-    innovation = difference(pose, state.pose)
+    innovation = pose_offset(pose, state.pose)
     expected = state.pose_covariance + covariance
     return float(innovation @ np.linalg.solve(expected, innovation))
 
@@ -102,7 +97,7 @@ def measured(state: FilterState, pose: FloatArray, covariance: FloatArray, optio
     shared, own = options.lasting * covariance, (1 - options.lasting) * covariance
     before = _with_shared(state.covariance, shared)
     seen = np.concatenate([np.eye(6), np.eye(6)], axis=1)
-    innovation = difference(pose, state.pose) - state.bias
+    innovation = pose_offset(pose, state.pose) - state.bias
     total = seen @ before @ seen.T + own
     gain = np.linalg.solve(total, seen @ before).T
     change = gain @ innovation

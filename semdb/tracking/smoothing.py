@@ -13,7 +13,8 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from semdb.tracking.pose_filter import POSE, FilterState, difference, shifted
+from semdb.geometry import pose_offset
+from semdb.tracking.pose_filter import POSE, FilterState, shifted
 from semdb.types import FloatArray
 
 Item = TypeVar("Item")
@@ -81,6 +82,6 @@ def _back(
     later = after.covariance if covariance is None else covariance
     gain = np.linalg.solve(predicted.covariance, passage.transition @ start.covariance).T
     pose = shifted(after.pose, change[POSE])
-    off = np.concatenate([difference(pose, predicted.pose), after.bias + change[6:] - predicted.bias])
+    off = np.concatenate([pose_offset(pose, predicted.pose), after.bias + change[6:] - predicted.bias])
     kept = start.covariance + gain @ (later - predicted.covariance) @ gain.T
     return gain @ off, (kept + kept.T) / 2

@@ -7,13 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from semdb.geometry import invert_pose, pose_error, pose_from, so3_exp
+from semdb.geometry import invert_pose, pose_error, pose_from, pose_offset, so3_exp
 from semdb.tracking.options import MotionOptions
 from semdb.tracking.pose_filter import (
     FilterState,
     Step,
     begin,
-    difference,
     measured,
     moved,
     shifted,
@@ -62,7 +61,7 @@ def run(seen: list[FloatArray], steps: list[Step], options: MotionOptions) -> li
 
 
 def off(state: FilterState, truth: FloatArray) -> float:
-    error = difference(truth, state.pose)
+    error = pose_offset(truth, state.pose)
     return float(error @ np.linalg.solve(state.pose_covariance, error))
 
 
@@ -103,7 +102,7 @@ def test_smoothing_is_better_than_the_filter_and_says_so() -> None:
             assert covariance is not None
             forward.append(pose_error(after.pose, poses[number])[0])
             both.append(pose_error(pose, poses[number])[0])
-            error = difference(poses[number], pose)
+            error = pose_offset(poses[number], pose)
             nees.append(float(error @ np.linalg.solve(covariance, error)))
             assert np.trace(covariance) <= np.trace(after.pose_covariance) + 1e-12
     assert np.mean(both) < 0.93 * np.mean(forward)
@@ -137,7 +136,7 @@ def test_difference_and_shifted_are_inverse(error: list[float], seed: int) -> No
     rng = np.random.default_rng(seed)
     pose = pose_from(so3_exp(rng.normal(0, 1, 3)), rng.normal(0, 3, 3))
     wanted = np.array(error) * [1, 1, 1, 0.5, 0.5, 0.5]
-    np.testing.assert_allclose(difference(shifted(pose, wanted), pose), wanted, atol=1e-9)
+    np.testing.assert_allclose(pose_offset(shifted(pose, wanted), pose), wanted, atol=1e-9)
 
 
 def test_surprise_counts_standard_deviations() -> None:
@@ -162,7 +161,7 @@ def test_a_camera_that_is_not_seen_comes_to_rest_and_gets_unsure() -> None:
 
 
 def so3_way(pose: FloatArray) -> FloatArray:
-    return difference(pose, np.eye(4))[3:]
+    return pose_offset(pose, np.eye(4))[3:]
 
 
 def test_odometry_is_as_unsure_as_its_way_is_long() -> None:

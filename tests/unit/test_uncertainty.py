@@ -12,9 +12,8 @@ from semdb.evaluation.uncertainty import (
     held_shares,
     nees_figures,
     normalised_error,
-    pose_offset,
 )
-from semdb.geometry import pose_from
+from semdb.geometry import pose_from, pose_offset
 
 
 def test_true_covariances_have_the_figures_of_chi_square() -> None:
