@@ -201,6 +201,7 @@ class Localizing(Base):
         from semdb.recordings import open_recording
         from semdb.recordings.arrays import as_camera
         from semdb.recordings.base import Recording as Opened
+        from semdb.recordings.dropped import lines_of_opening
 
         if isinstance(recording, Opened):
             return recording
@@ -208,12 +209,8 @@ class Localizing(Base):
         if chosen is None and like is not None:
             chosen = self._like(self._here.maps().asked(map, "sql"), str(like)).camera
         opened = open_recording(Path(recording), chosen, reading)
-        for line in opened.said:
-            self._say(f"{opened.name}: {line}")
-        if opened.dropped:
-            first = opened.dropped[0]
-            count = f"{len(opened.dropped)} of {opened.total_frames} frames cannot be used"
-            self._say(f"{opened.name}: {count}; the first, {first.name}: {first.reason}")
+        for line in lines_of_opening(opened):
+            self._say(line)
         return opened
 
     def _answers(

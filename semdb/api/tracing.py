@@ -37,6 +37,7 @@ class Tracing(Base):
         Raises RecordingError for a recording without depth or in which nothing can be placed, UsageError, ModelError.
         """
         from semdb.api.sources import ingest_options, open_source
+        from semdb.recordings.dropped import lines_of_opening
         from semdb.trajectory.recording import find_recorded
 
         options = ingest_options(None, "frames", None, None, camera, reading, depth_scale)
@@ -45,6 +46,8 @@ class Tracing(Base):
             if len(recordings) != 1:
                 names = ", ".join(recording.name for recording in recordings)
                 raise UsageError(f"a trajectory is of one recording, but these are {len(recordings)}: {names}")
+            for line in lines_of_opening(recordings[0]):
+                self._say(line)
             return find_recorded(recordings[0], every=every, encoder=encoder, progress=progress)
 
 

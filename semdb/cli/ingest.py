@@ -214,7 +214,7 @@ def _described(summary: IngestSummary) -> list[str]:
 def as_lines(summary: IngestSummary) -> list[str]:
     """What is printed for people."""
     from semdb.cli.align import as_lines as alignment_lines
-    from semdb.cli.recording import group_dropped
+    from semdb.recordings.dropped import group_dropped
 
     alignment = [] if summary.alignment is None else alignment_lines(summary.alignment)
     seconds = summary.seconds

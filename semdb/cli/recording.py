@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,11 +14,9 @@ from semdb.shown import measure, number
 
 if TYPE_CHECKING:
     from semdb.evaluation.pose_comparison import PoseComparison
-    from semdb.recordings import DroppedFrame, Recording
+    from semdb.recordings import Recording
     from semdb.recordings.check import Report
     from semdb.types import Camera
-
-NAMES_SHOWN = 3
 
 
 @reading_options()
@@ -222,6 +219,8 @@ def check_json(report: Report) -> dict[str, Any]:
 
 def as_lines(recording: Recording, quick: bool) -> list[str]:
     """What is printed for people."""
+    from semdb.recordings.dropped import group_dropped
+
     found = counts(recording)
     dropped = (*recording.dropped, *recording.decode_failures)
     triples = f"{found['triples']} with colour, depth and pose"
@@ -252,17 +251,3 @@ def describe_camera(camera: Camera) -> str:
     if camera.model == "PINHOLE":
         return f"{text}, no distortion"
     return f"{text}, distortion {', '.join(map(number, camera.distortion))}"
-
-
-def group_dropped(dropped: Iterable[DroppedFrame]) -> list[str]:
-    """One line per reason: how many, why, and the first names. Reasons that differ in numbers only are one."""
-    groups: dict[str, list[DroppedFrame]] = {}
-    for frame in dropped:
-        key = re.sub(r"\d+(\.\d+)?", "#", frame.reason.replace(frame.name, ""))
-        groups.setdefault(key, []).append(frame)
-    lines = []
-    for frames in groups.values():
-        names = ", ".join(frame.name for frame in frames[:NAMES_SHOWN])
-        more = f" and {len(frames) - NAMES_SHOWN} more" if len(frames) > NAMES_SHOWN else ""
-        lines.append(f"{len(frames)} x {frames[0].reason}: {names}{more}")
-    return lines

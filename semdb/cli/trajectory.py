@@ -43,12 +43,15 @@ def command(
 
     No model file is needed; a place encoder may be given to propose loop closures.
     """
-    from semdb.cli.progress import StagedProgress
+    from semdb.cli.progress import StagedProgress, say
     from semdb.recordings import open_recording, parse_camera
+    from semdb.recordings.dropped import lines_of_opening
     from semdb.trajectory.recording import find_recorded
 
     recording = open_recording(path, None if camera is None else parse_camera(camera), reading)
     check_outputs(out, json_file, plot)
+    for line in lines_of_opening(recording):
+        say(line)
     chosen = encoder_of(encoder)
     started = time.perf_counter()
     with StagedProgress(UNITS) as progress:
@@ -104,8 +107,9 @@ def write(
         with named(out):
             out.write_text(trajectory_text(found), encoding="utf-8")
     if json_file is not None:
+        dropped = [{"name": one.name, "reason": one.reason} for one in recording.dropped]
         with named(json_file), json_file.open("w", encoding="utf-8") as stream:
-            print_json({"recording": recording.name, **summary(found, seconds)}, stream)
+            print_json({"recording": recording.name, "dropped": dropped, **summary(found, seconds)}, stream)
     if plot is not None:
         name = re.sub(r"[^\w.+-]+", "_", recording.name).strip("_.") or "recording"
         picture = plot / f"{name}-trajectory.png"

@@ -169,6 +169,7 @@ class Localizing(Reading):
         from semdb.recordings import open_recording
         from semdb.recordings.arrays import as_camera
         from semdb.recordings.base import Recording as Opened
+        from semdb.recordings.dropped import lines_of_opening
 
         if isinstance(recording, Opened):
             return recording
@@ -177,12 +178,8 @@ class Localizing(Reading):
             reader = self._reader(map, None, like, None, ())
             chosen = reader.like.camera if reader.like is not None else self._camera_there(str(like), map)
         opened = open_recording(Path(recording), chosen, reading)
-        for line in opened.said:
-            self._say(f"{opened.name}: {line}")
-        if opened.dropped:
-            first = opened.dropped[0]
-            count = f"{len(opened.dropped)} of {opened.total_frames} frames cannot be used"
-            self._say(f"{opened.name}: {count}; the first, {first.name}: {first.reason}")
+        for line in lines_of_opening(opened):
+            self._say(line)
         return opened
 
     def _reader(

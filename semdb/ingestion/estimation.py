@@ -15,7 +15,8 @@ from semdb.database.pose_records import Link, LinkKind, LinkState, PlannedPoses,
 from semdb.database.pose_sources import load_planned_poses, recording_poses
 from semdb.database.store import Store
 from semdb.errors import RecordingError, UsageError
-from semdb.recordings.base import FrameEntry, Recording
+from semdb.recordings.base import DroppedFrame, FrameEntry, Recording
+from semdb.recordings.dropped import group_dropped
 from semdb.trajectory.carried import carried_edges
 from semdb.trajectory.odometry import FrameState
 from semdb.trajectory.recording import RecordedTrajectory, find_recorded
@@ -157,6 +158,12 @@ def told(found: RecordedTrajectory) -> list[str]:
         f"{len(trajectory.used)} of {len(trajectory.frames)} frames have an estimated pose, "
         f"{len(trajectory.closures())} loop closures count; the world has its origin at the first keyframe, {up}"
     ]
+    without = [
+        DroppedFrame(f"frame {found.entries[frame.position].index}", frame.reason)
+        for frame in trajectory.frames
+        if not frame.placed
+    ]
+    lines += [f"left out without a pose: {line}" for line in group_dropped(without)]
     laid = trajectory.count(FrameState.LAID)
     if laid:
         lines.append(f"{laid} frames, which keypoints did not carry, were tracked by surfaces")

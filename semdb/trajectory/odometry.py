@@ -235,6 +235,8 @@ class Odometry:
         if begins and frame.with_depth >= self.options.keyframes.least_points:
             return self._begin_piece(frame)
         reason = "too little of it is seen by keyframes"
+        if not len(self.keyframes):
+            reason = "too few keypoints have depth for a first keyframe"
         if frame.with_depth < self.options.keyframes.least_points:
             reason += f"; {frame.with_depth} keypoints have depth"
         return FrameTrack(frame.position, frame.time_s, FrameState.LOST, reason)

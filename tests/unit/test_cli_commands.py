@@ -15,10 +15,10 @@ import pytest
 from typer.testing import CliRunner
 
 from semdb.cli.main import app
-from semdb.cli.recording import group_dropped
 from semdb.database import schema
 from semdb.database.store import open_store
 from semdb.recordings import DroppedFrame
+from semdb.recordings.dropped import group_dropped
 from tests.database_samples import fill, plan
 from tests.unit.onnx_files import write_constant_model
 from tests.unit.recording_miniatures import write_tum

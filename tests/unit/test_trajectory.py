@@ -15,6 +15,7 @@ import semdb
 from semdb.cli.main import app
 from semdb.errors import FrameError, RecordingError, UsageError
 from semdb.evaluation.trajectory_errors import trajectory_errors
+from semdb.ingestion.estimation import told
 from semdb.perception.encoders.gist import GistEncoder
 from semdb.perception.features.surf_features import SurfFeatures
 from semdb.recordings import open_recording
@@ -282,6 +283,33 @@ def test_the_command_refuses_what_it_cannot_do(room_path: Path, tmp_path: Path) 
     assert no_depth.exit_code == 1
     assert "without depth no trajectory is found" in no_depth.stderr
     assert run(app, ["trajectory", str(room_path), "--every", "0"]).exit_code == 2
+
+
+def test_frames_that_cannot_be_used_are_told(room_path: Path, tmp_path: Path) -> None:
+    """One whose depth is cut off, and one that shows nothing, of four."""
+    import cv2
+
+    for folder in ("rgb", "depth"):
+        (tmp_path / folder).mkdir()
+        lines = (room_path / f"{folder}.txt").read_text().splitlines()
+        rows = [line for line in lines if not line.startswith("#")][:4]
+        (tmp_path / f"{folder}.txt").write_text("\n".join(rows) + "\n")
+        for row in rows:
+            (tmp_path / row.split()[1]).write_bytes((room_path / row.split()[1]).read_bytes())
+    (tmp_path / "camera.json").write_bytes((room_path / "camera.json").read_bytes())
+    depth, colour = sorted((tmp_path / "depth").iterdir())[1], sorted((tmp_path / "rgb").iterdir())[2]
+    depth.write_bytes(depth.read_bytes()[:2000])
+    cv2.imwrite(str(colour), np.full((240, 320, 3), 128, np.uint8))
+    out = tmp_path / "found.json"
+    result = CliRunner().invoke(app, ["trajectory", str(tmp_path), "--json", str(out)])
+    assert result.exit_code == 0, result.output
+    assert "1 of 4 frames cannot be used; the first, rgb/" in result.stderr
+    assert "no groundtruth.txt: the frames have no pose" in result.stderr
+    summary = json.loads(out.read_text())
+    assert ["the file ends too early" in one["reason"] for one in summary["dropped"]] == [True]
+    assert (summary["frames"], summary["tracked"]) == (3, 2)
+    said = told(find_recorded(open_recording(tmp_path), options=TrajectoryOptions(threads=1)))
+    assert "left out without a pose: 1 x shows nothing: the image is of one grey: frame 2" in said
 
 
 def test_a_recording_of_black_frames_is_an_error(tmp_path: Path) -> None:
