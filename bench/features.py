@@ -1,10 +1,17 @@
-"""Local features against each other on recordings: time, repeatability, matches and the poses they give.
+"""Local features against each other, as what maps are made of: recordings, numbers of keyframes, conditions.
 
-    python -m bench.features RECORDING... [--pairs N] [--json FILE] [--plot FILE]
+    python -m bench.features [RECORDING...] [--room N]... [--keyframes 6,12] [--conditions clean,small] [--json FILE]
 
-One thread, all features in the same run; time is processor time, so that other work on the machine matters little.
-Pairs of frames at several gaps; the first frame of a pair has depth and stands for a keyframe, the second is the query.
-Figures depend on the machine; the ratios at the end hardly do.
+Keyframes and queries are those of ``semdb evaluate``, networks those of SEMDB_DETECTOR and SEMDB_ENCODER; learned
+features are SEMDB_FEATURES_FALLBACK and SEMDB_MATCHER, which have to be named. All features answer the same queries
+through the same cascade, pose and verdict. ``--room N`` is a rendered room with exact masks, kept in ``--work`` as
+the maps are; what ``--json`` already holds is not measured again, so that a run goes on where it ended. Times are
+processor time on one thread.
+
+clean    as recorded
+night    a fifth of the light, from elsewhere and of another colour, with the noise of a sensor (rendered rooms only)
+small    a third of the resolution, up again
+blurN    motion of N pixels
 """
 
 from __future__ import annotations
@@ -12,311 +19,337 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import tempfile
 import time
-import warnings
-from collections import defaultdict
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-import poselib
+from sqlalchemy import func, select
 
-from semdb.geometry import back_project, invert_pose, pixels_to_normalized, pose_error, project, transform_points
-from semdb.perception.features.sift import SiftFeatures
-from semdb.perception.features.surf import SURF
-from semdb.perception.features.surf_features import SurfFeatures
-from semdb.recordings import Recording, open_recordings
-from semdb.types import Camera
+from bench.poor_images import degraded
+from bench.trust.images import Picture, darkened
+from semdb.cli.options import load_settings
+from semdb.database import tables
+from semdb.database.store import Store, open_store
+from semdb.evaluation.tasks import PaperPlan, Task
+from semdb.geometry import pose_error
+from semdb.ingestion.run import IngestOptions, ingest_recording
+from semdb.localization.images import make_localizer
+from semdb.localization.localizer import Localizer
+from semdb.perception.describe import Describer, describer_from_specs
+from semdb.perception.features import load_features
+from semdb.perception.model_choice import specs_for_ingest
+from semdb.perception.protocols import FeatureExtractor
+from semdb.recordings import open_recordings
+from semdb.recordings.base import Recording
+from semdb.recordings.synthetic import SyntheticOptions, write_synthetic_recording
+from semdb.refinement.run import refine_map
+from semdb.refinement.steps import FOR_LOCALIZATION
+from semdb.settings import Settings
+from semdb.types import Description, Detection, Float32Array, FloatArray, Frame, ImageArray, InstanceMasks, Verdict
 
-GAPS = (1, 2, 4, 8, 16)  # frames of the recording
-REPEAT_PX = 3.0
-RIGHT_PX = 5.0  # of a match; the recorded poses alone are off by up to 3 pixels
-VISIBLE_M = 0.05  # a point is visible in the other frame if depth there agrees to this and 5 %
-RATIO = 0.8
-SUCCESS = (0.05, 5.0)  # metres, degrees
-REFERENCE, OURS = "sift 1000", "surf 100"
-
-Extract = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]  # grey -> xy [n, 2], descriptors [n, d]
-
-
-@dataclass
-class View:
-    """What one feature found in one frame, with the 3D points (world, NaN where there is no depth)."""
-
-    xy: np.ndarray
-    descriptors: np.ndarray
-    points: np.ndarray
-
-
-@dataclass
-class Shot:
-    """One frame without its pixels."""
-
-    depth: np.ndarray
-    pose: np.ndarray
-    views: dict[str, View] = field(default_factory=dict)
+FALSE, WITHIN = (0.25, 5.0), (0.05, 5.0)  # metres, degrees
+NIGHT = 0.2  # of the light
+ROOM_FRAMES = 48  # once around
+BYTES = (("keypoints", "data"), ("descriptors", "data"))
+Key = tuple[str, int, str, str]  # recording, keyframes, condition, feature
 
 
-@dataclass
-class Tally:
-    """Sums over frames and pairs of one feature."""
+@dataclass(frozen=True, slots=True)
+class Contestant:
+    """A feature of a map, with what is asked beside it."""
 
-    milliseconds: list[float] = field(default_factory=list)
-    keypoints: list[int] = field(default_factory=list)
-    pairs: dict[int, list[dict[str, float]]] = field(default_factory=lambda: defaultdict(list))
-
-
-def features() -> dict[str, Extract]:
-    """The contestants. SIFT as RootSIFT, at its precise positions; pycolmap's only where it is installed."""
-
-    def from_opencv(feature: Any) -> Extract:
-        def extract(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            keypoints, descriptors = feature.detectAndCompute(grey, None)
-            return np.array([k.pt for k in keypoints], np.float32).reshape(-1, 2), descriptors
-
-        return extract
-
-    def from_semdb(feature: Any) -> Extract:
-        def extract(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            found = feature.extract(grey)
-            return found.xy, found.descriptors
-
-        return extract
-
-    contestants = {
-        OURS: from_semdb(SurfFeatures(100, max_keypoints=0)),
-        "surf 400": from_semdb(SurfFeatures(400, max_keypoints=0)),
-        "surf 100, best 1000": from_semdb(SurfFeatures(100, max_keypoints=1000)),
-        "surf 100 as OpenCV": from_semdb(SURF(100)),
-        REFERENCE: from_semdb(SiftFeatures(1000)),
-        "orb 1000": from_opencv(cv2.ORB.create(1000)),
-        "akaze": from_opencv(_akaze()),
-    }
-    try:
-        import pycolmap
-    except ImportError:
-        print("pycolmap is not installed: its SIFT is left out", file=sys.stderr)
-        return contestants
-    options = pycolmap.FeatureExtractionOptions()
-    options.sift.max_num_features = 1000
-    options.num_threads = 1
-    pycolmap.logging.minloglevel = 2
-    with warnings.catch_warnings(action="ignore"):  # its successor takes no arrays
-        sift = pycolmap.Sift(options, pycolmap.Device.cpu)
-
-    def extract_pycolmap(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        keypoints, descriptors = sift.extract(grey)
-        return keypoints[:, :2] - np.float32(0.5), descriptors  # COLMAP's first pixel is centred at 0.5
-
-    return contestants | {"sift 1000 (pycolmap)": extract_pycolmap}
+    name: str
+    features: str
+    matcher: str | None = None
+    fallback: str | None = None
 
 
-def _akaze() -> Any:
-    return cv2.AKAZE_create() if hasattr(cv2, "AKAZE_create") else cv2.xfeatures2d.AKAZE_create()
+@dataclass(frozen=True, slots=True)
+class Row:
+    """What one feature does in one place under one condition; medians are of the localized queries."""
+
+    recording: str
+    keyframes: int
+    condition: str
+    feature: str
+    queries: int
+    localized: int
+    within: int  # 5 cm and 5 degrees, and localized
+    false: int
+    median_m: float | None
+    median_deg: float | None
+    inliers: float  # median over all queries
+    extract_ms: float
+    localize_ms: float
+    kilobytes: float  # of keypoints and descriptors, a keyframe
+
+    @property
+    def key(self) -> Key:
+        return self.recording, self.keyframes, self.condition, self.feature
 
 
-def describe(
-    recording: Recording, contestants: dict[str, Extract], tallies: dict[str, Tally], limit: int
-) -> list[Shot]:
-    """Every feature on every frame, one after the other so that all see the machine in the same state."""
-    entries = [entry for entry in recording.entries if entry.world_from_camera is not None][: limit or None]
-    shots = []
-    for number, entry in enumerate(entries):
-        frame = recording.read(entry)
-        if frame.depth is None or frame.world_from_camera is None:
-            continue
-        grey = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
-        shot = Shot(frame.depth, frame.world_from_camera)
-        for name, extract in contestants.items():
-            if number == 0:
-                extract(grey)  # compiles, warms caches
-            start = time.process_time()
-            xy, descriptors = extract(grey)
-            tallies[name].milliseconds.append((time.process_time() - start) * 1e3)
-            tallies[name].keypoints.append(len(xy))
-            z = look_up(frame.depth, xy)
-            points = transform_points(shot.pose, back_project(recording.camera, xy, z))
-            shot.views[name] = View(xy, descriptors, points)
-        shots.append(shot)
-        if sys.stderr.isatty():
-            print(f"\r{recording.name}: described {number + 1}/{len(entries)}", end="", file=sys.stderr)
-    return shots
+@dataclass(frozen=True, slots=True, eq=False)
+class Place:
+    """A recording that becomes a map and is asked about; `night` is the same walk in other light."""
+
+    recording: Recording
+    night: Recording | None = None
 
 
-def look_up(depth: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    """Depth at the nearest pixel, NaN outside."""
-    column, row = np.rint(np.clip(np.nan_to_num(xy, nan=-1.0), -1, 1e6)).astype(int).T
-    inside = (column >= 0) & (row >= 0) & (column < depth.shape[1]) & (row < depth.shape[0])
-    z = np.full(len(xy), np.nan)
-    z[inside] = depth[row[inside], column[inside]]
-    return z
+class Remembered:
+    """A detector and an encoder whose answers are kept, so that every feature is told the same at no cost."""
+
+    def __init__(self, describer: Describer) -> None:
+        self.key: object = None
+        self._describer = describer
+        self._found: dict[object, tuple[tuple[Detection, ...], Float32Array]] = {}
+        self.detector: Any = _Half(describer.detector, self.detect)
+        self.encoder: Any = _Half(describer.encoder, self.encode)
+
+    @property
+    def knows(self) -> bool:
+        return self.key in self._found
+
+    def _both(self, image: ImageArray, instances: InstanceMasks | None) -> tuple[tuple[Detection, ...], Float32Array]:
+        if self.key not in self._found:
+            own = self._describer
+            self._found[self.key] = own.detector.detect(image, instances), own.encoder.encode(image)
+        return self._found[self.key]
+
+    def detect(self, image: ImageArray, instances: InstanceMasks | None = None) -> tuple[Detection, ...]:
+        return self._both(image, instances)[0]
+
+    def encode(self, image: ImageArray) -> Float32Array:
+        return self._found[self.key][1]
 
 
-def compare(first: Shot, second: Shot, name: str, camera: Camera) -> dict[str, float]:
-    """Repeatability, matches, precision, and the error of the pose of `second` from the points of `first`."""
-    a, b = first.views[name], second.views[name]
-    if len(a.xy) < 2 or len(b.xy) < 2:
-        nothing = dict.fromkeys(("precision", "consistent"), float("nan"))
-        return {"repeatability": 0.0, "matches": 0, **nothing, "metres": np.inf, "degrees": np.inf}
-    in_second = transform_points(invert_pose(second.pose), a.points)
-    there = project(camera, in_second)
-    z = look_up(second.depth, there)
-    visible = np.abs(z - in_second[:, 2]) < np.maximum(VISIBLE_M, 0.05 * in_second[:, 2])
-    distances = np.full(len(a.xy), np.inf)
-    for k in np.flatnonzero(visible):
-        distances[k] = np.hypot(*(b.xy - there[k]).T).min()
-    norm = cv2.NORM_HAMMING if a.descriptors.dtype == np.uint8 else cv2.NORM_L2
-    two = cv2.BFMatcher(norm).knnMatch(b.descriptors, a.descriptors, k=2)
-    pairs = np.array([(m.queryIdx, m.trainIdx) for m, n in two if m.distance < RATIO * n.distance]).reshape(-1, 2)
-    pairs = pairs[np.isfinite(a.points[pairs[:, 1], 0])]
-    right = np.hypot(*(b.xy[pairs[:, 0]] - there[pairs[:, 1]]).T) < RIGHT_PX
-    metres, degrees, consistent = pose_of(b.xy[pairs[:, 0]], a.points[pairs[:, 1]], camera, second.pose)
-    return {
-        "repeatability": float((distances[visible] < REPEAT_PX).mean()) if visible.any() else float("nan"),
-        "matches": len(pairs),
-        "precision": float(right.mean()) if len(pairs) else float("nan"),
-        "consistent": consistent,
-        "metres": metres,
-        "degrees": degrees,
-    }
+class _Half:
+    """A network of `Remembered`, by the name that the describer calls."""
+
+    def __init__(self, own: Any, work: Callable[..., Any]) -> None:
+        self.info, self.classes = own.info, getattr(own, "classes", ())
+        self.detect = self.encode = work
 
 
-def pose_of(xy: np.ndarray, points: np.ndarray, camera: Camera, truth: np.ndarray) -> tuple[float, float, float]:
-    """Error (metres, degrees) of the pose by LO-RANSAC PnP, infinite with fewer than 12 inliers; share of inliers."""
-    undistorted = pixels_to_normalized(camera, xy) * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-    fine = np.isfinite(undistorted).all(axis=1)
-    if fine.sum() < 12:
-        return np.inf, np.inf, float("nan")
-    model = {
-        "model": "PINHOLE",
-        "width": camera.width,
-        "height": camera.height,
-        "params": [camera.fx, camera.fy, camera.cx, camera.cy],
-    }
-    ransac = {"max_reproj_error": 6.0, "min_iterations": 200, "max_iterations": 5000, "seed": 0}
-    pose, info = poselib.estimate_absolute_pose(undistorted[fine], points[fine], model, ransac)
-    if info["num_inliers"] < 12:
-        return np.inf, np.inf, info["num_inliers"] / len(xy)
-    camera_from_world = np.eye(4)
-    camera_from_world[:3] = pose.Rt
-    return *pose_error(invert_pose(camera_from_world), truth), info["num_inliers"] / len(xy)
+def contestants(settings: Settings) -> list[Contestant]:
+    """SURF and SIFT, and what the settings name of learned features."""
+    learned, matcher = settings.features_fallback, settings.matcher
+    found = [Contestant("SURF", "surf"), Contestant("SIFT", "sift")]
+    if learned is None:
+        print("SEMDB_FEATURES_FALLBACK is not set: learned features are left out", file=sys.stderr)
+        return found
+    found.append(Contestant("learned", learned))
+    if matcher is not None:
+        found.append(Contestant("learned, with matcher", learned, matcher))
+    return [*found, Contestant("SURF, then learned", "surf", None, learned)]
 
 
-def summarise(tally: Tally) -> dict[str, Any]:
-    """Medians over frames, means over pairs per gap; errors are medians over the successful pairs."""
-    milliseconds, keypoints = float(np.median(tally.milliseconds)), float(np.mean(tally.keypoints))
-    gaps = {}
-    for gap, results in sorted(tally.pairs.items()):
-        metres = np.array([r["metres"] for r in results])
-        degrees = np.array([r["degrees"] for r in results])
-        good = (metres < SUCCESS[0]) & (degrees < SUCCESS[1])
-        gaps[str(gap)] = {
-            "pairs": len(results),
-            "repeatability": float(np.nanmean([r["repeatability"] for r in results])),
-            "matches": float(np.mean([r["matches"] for r in results])),
-            "precision": float(np.nanmean([r["precision"] for r in results])),
-            "consistent": float(np.nanmean([r["consistent"] for r in results])),
-            "success": float(good.mean()),
-            "median_metres": float(np.median(metres[good])) if good.any() else None,
-            "median_degrees": float(np.median(degrees[good])) if good.any() else None,
-        }
-    return {
-        "frames": len(tally.milliseconds),
-        "ms_per_frame": milliseconds,
-        "keypoints": keypoints,
-        "us_per_keypoint": 1e3 * float(np.mean(tally.milliseconds)) / max(keypoints, 1),
-        "gaps": gaps,
-    }
+def room(work: Path, number: int) -> Place:
+    """A rendered room and the same by night, in `work`."""
+    day = SyntheticOptions(
+        frames=ROOM_FRAMES, lap_frames=ROOM_FRAMES, seed=number, room_seed=100 + number,
+        furniture_seed=200 + number, noise=True,
+    )  # fmt: skip
+    opened = []
+    for name, options in ((f"room{number}", day), (f"room{number}-night", replace(day, lighting=1.0))):
+        if not (work / name).exists():
+            print(f"rendering {name}", file=sys.stderr)
+            write_synthetic_recording(work / name, options)
+        opened.append(open_recordings(work / name)[0])
+    return Place(*opened)
 
 
-def ratios(results: dict[str, Any]) -> dict[str, Any]:
-    """Ours against the reference: times as fast per frame, and the difference of success at every gap."""
-    ours, theirs = results[OURS], results[REFERENCE]
-    return {
-        "times_as_fast": {
-            name: result["ms_per_frame"] / ours["ms_per_frame"] for name, result in results.items() if name != OURS
-        },
-        "success_difference": {
-            gap: ours["gaps"][gap]["success"] - theirs["gaps"][gap]["success"] for gap in ours["gaps"]
-        },
-    }
+def seen_as(place: Place, frame: Frame, condition: str, seed: int) -> Frame:
+    """A query `frame` under a condition; the same image every time."""
+    rng = np.random.default_rng([seed, frame.index])
+    if condition != "night":
+        return replace(frame, image=degraded(frame.image, condition, rng))
+    assert place.night is not None
+    entry = next(entry for entry in place.night.entries if entry.index == frame.index)
+    image = place.night.read_image(entry)
+    return replace(frame, image=darkened(Picture(image, frame.camera, None), rng, NIGHT).image)
 
 
-def show(results: dict[str, Any], compared: dict[str, Any]) -> None:
-    print(f"{'':22s} {'ms/frame':>9s} {'keypoints':>9s} {'us/kp':>6s}")
-    for name, result in results.items():
-        print(f"{name:22s} {result['ms_per_frame']:9.1f} {result['keypoints']:9.0f} {result['us_per_keypoint']:6.1f}")
-    for quantity in (
-        "repeatability",
-        "matches",
-        "precision",
-        "consistent",
-        "success",
-        "median_metres",
-        "median_degrees",
-    ):
-        print(f"\n{quantity + ' at gap':22s} " + " ".join(f"{gap:>8s}" for gap in results[OURS]["gaps"]))
-        for name, result in results.items():
-            cells = (
-                f"{'-' if v[quantity] is None else format(v[quantity], '.3f'):>8s}" for v in result["gaps"].values()
-            )
-            print(f"{name:22s} " + " ".join(cells))
-    print(f"\n{OURS} takes one part in so many of the time per frame of:")
-    for name, ratio in compared["times_as_fast"].items():
-        print(f"  {name:22s} {ratio:.2f}")
-    print(f"{OURS} minus {REFERENCE}, success at gap:", compared["success_difference"])
+class Measuring:
+    """All features on one place: one map for each feature and number of keyframes, kept in `work`."""
+
+    def __init__(self, place: Place, settings: Settings, work: Path) -> None:
+        self.place, self.settings, self.work = place, settings, work
+        specs = specs_for_ingest(settings, (), has_masks=place.recording.categories is not None)
+        self._first = describer_from_specs(specs.detector, specs.encoder, "surf", settings)
+        self._remembered = Remembered(self._first)
+        self._extractors: dict[str, FeatureExtractor] = {}
+        self._described: dict[tuple[str, str, int], tuple[Description, float]] = {}
+
+    def describer(self, features: str, networks: Describer | Remembered) -> Describer:
+        if features not in self._extractors:
+            self._extractors[features] = load_features(features, self.settings)
+        return Describer(networks.detector, networks.encoder, self._extractors[features], self._first.rules)
+
+    def describe(self, features: str, frame: Frame, condition: str) -> tuple[Description, float]:
+        """What a map of `features` is told of a query, and the milliseconds of the feature."""
+        key = features, condition, frame.index
+        if key not in self._described:
+            describer = self.describer(features, self._remembered)
+            self._remembered.key = condition, frame.index
+            seen = seen_as(self.place, frame, condition, 0)
+            if not self._remembered.knows:  # the networks are not what is timed
+                describer.describe(seen.image, None, seen.camera, seen.instances)
+            started = time.process_time()
+            found = describer.describe(seen.image, None, seen.camera, seen.instances)
+            self._described[key] = found, 1000 * (time.process_time() - started)
+        return self._described[key]
+
+    def store(self, features: str, task: Task) -> Store:
+        """The map, made where it is not there yet."""
+        count = sum(len(part.entries) for part in task.keyframes)
+        name = f"{self.place.recording.name}-{count}-{features.rpartition('/')[2]}.sqlite3".replace(":", "-")
+        path, new = self.work / name, self.work / f"{name}.new"
+        if not path.exists():
+            new.unlink(missing_ok=True)
+            with open_store(f"sqlite:///{new}", create=True) as store:
+                describer, options = self.describer(features, self._first), IngestOptions(map_name="m")
+                for part in task.keyframes:
+                    ingest_recording(part.recording, store, describer, options, entries=list(part.entries))
+                refine_map(store, store.find_map("m"), kinds=FOR_LOCALIZATION)
+            new.rename(path)
+        return open_store(f"sqlite:///{path}")
+
+    def row(self, contestant: Contestant, task: Task, condition: str) -> Row:
+        own = self.settings.model_copy(
+            update={
+                "features": contestant.features,
+                "matcher": contestant.matcher,
+                "features_fallback": contestant.fallback,
+            }
+        )
+        with self.store(contestant.features, task) as store:
+            localizer = make_localizer(store, store.find_map("m"), "sql", settings=own)
+            answers = list(self._answers(localizer, contestant, task, condition))
+            return _row(
+                (self.place.recording.name, len(store.keyframe_ids(1)), condition, contestant.name),
+                answers, kilobytes(store),
+            )  # fmt: skip
+
+    def _answers(
+        self, localizer: Localizer, contestant: Contestant, task: Task, condition: str
+    ) -> Iterator[tuple[bool, float, float, int, float, float]]:
+        """Whether localized, errors, inliers, milliseconds of feature and of localization."""
+        for part in task.queries:
+            for entry in part.entries:
+                frame = part.recording.read(entry)
+                description, extract = self.describe(contestant.features, frame, condition)
+                started = time.process_time()
+                found = localizer.localize(description)
+                spent = 1000 * (time.process_time() - started)
+                metres, degrees = float("inf"), float("inf")
+                if found.world_from_camera is not None and frame.world_from_camera is not None:
+                    metres, degrees = pose_error(found.world_from_camera, frame.world_from_camera)
+                yield found.verdict is Verdict.LOCALIZED, metres, degrees, found.inliers, extract, spent
 
 
-def plot(results: dict[str, Any], path: Path) -> None:
-    """Time per frame, and the share of right poses over the gap."""
-    import matplotlib as mpl
+def _row(key: Key, answers: Sequence[tuple[bool, float, float, int, float, float]], size: float) -> Row:
+    localized, *columns = (np.array(column) for column in zip(*answers, strict=True))
+    metres, degrees, inliers, extract, spent = columns
+    sure = localized.astype(bool)
 
-    mpl.use("agg")
-    from matplotlib import pyplot as plt
+    def median(values: FloatArray) -> float | None:
+        return float(np.median(values[sure])) if sure.any() else None
 
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
-    colors = [f"C{k}" for k in range(len(results))]
-    left.barh(list(results), [result["ms_per_frame"] for result in results.values()], color=colors)
-    left.invert_yaxis()
-    left.set_xlabel("ms per 640x480 frame, one thread")
-    for (name, result), color in zip(results.items(), colors, strict=True):
-        gaps = result["gaps"]
-        right.plot(range(len(gaps)), [100 * v["success"] for v in gaps.values()], "o-", ms=3, label=name, color=color)
-    right.set_xticks(range(len(gaps)), list(gaps))
-    right.set_xlabel("gap between the frames of a pair")
-    right.set_ylabel("poses within 5 cm and 5°, %")
-    right.legend(fontsize=7)
-    figure.savefig(path, dpi=110)
+    inside = sure & (metres <= WITHIN[0]) & (degrees <= WITHIN[1])
+    wrong = sure & ((metres > FALSE[0]) | (degrees > FALSE[1]))
+    return Row(
+        *key, len(answers), int(sure.sum()), int(inside.sum()), int(wrong.sum()), median(metres), median(degrees),
+        float(np.median(inliers)), float(np.median(extract)), float(np.median(spent)), size,
+    )  # fmt: skip
 
 
-def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(prog="python -m bench.features", description=__doc__.split("\n", 1)[0])
-    parser.add_argument("recordings", nargs="+", type=Path)
-    parser.add_argument("--pairs", type=int, default=60, help="pairs per gap and recording")
-    parser.add_argument("--frames", type=int, default=0, help="look at so many frames of each recording only")
-    parser.add_argument("--json", type=Path, help="write all figures to this file")
-    parser.add_argument("--plot", type=Path, help="write a figure to this file")
-    options = parser.parse_args(arguments)
+def kilobytes(store: Store) -> float:
+    """Of the keypoints and descriptors of a keyframe, in the mean."""
+    total = 0
+    with store.engine.connect() as connection:
+        for table, column in BYTES:
+            size = select(func.sum(func.length(tables.metadata.tables[table].c[column])))
+            total += int(connection.execute(size).scalar() or 0)
+    return total / 1024 / len(store.keyframe_ids(1))
+
+
+def show(rows: Sequence[Row]) -> None:
+    """As a table of Markdown."""
+    print(
+        "| recording | keyframes | condition | feature | localized | within 5 cm, 5° | false | median | inliers "
+        "| extract + localize | KiB a keyframe |\n|" + "---|" * 11
+    )
+    for row in rows:
+        middle = "-" if row.median_m is None else f"{row.median_m:.4f} m {row.median_deg:.2f}°"
+        print(
+            f"| {row.recording} | {row.keyframes} | {row.condition} | {row.feature} | {row.localized} of {row.queries} "
+            f"| {row.within} | {row.false} | {middle} | {row.inliers:.0f} "
+            f"| {row.extract_ms:.0f} + {row.localize_ms:.0f} ms | {row.kilobytes:.0f} |"
+        )
+
+
+def main(given: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("recordings", nargs="*", type=Path)
+    parser.add_argument("--room", type=int, action="append", default=[], help="a rendered room, by number")
+    parser.add_argument("--keyframes", default="12")
+    parser.add_argument("--conditions", default="clean")
+    parser.add_argument("--queries", type=int, default=40)
+    parser.add_argument("--only", help="features by name, in their order, separated by semicolons")
+    parser.add_argument("--work", type=Path, help="rooms and maps are kept here and found again")
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args(given)
     cv2.setNumThreads(1)
-    contestants = features()
-    tallies = {name: Tally() for name in contestants}
-    for recording in [r for path in options.recordings for r in open_recordings(path)]:
-        shots = describe(recording, contestants, tallies, options.frames)
-        for gap in GAPS:
-            starts = np.unique(np.linspace(0, len(shots) - 1 - gap, options.pairs).astype(int))
-            for start in starts[starts >= 0].tolist():
-                for name, tally in tallies.items():
-                    tally.pairs[gap].append(compare(shots[start], shots[start + gap], name, recording.camera))
-    results = {name: summarise(tally) for name, tally in tallies.items()}
-    compared = ratios(results)
-    show(results, compared)
-    if options.json:
-        options.json.write_text(json.dumps({"features": results, "ratios": compared}, indent=1) + "\n")
-    if options.plot:
-        plot(results, options.plot)
+    rows = [] if arguments.json is None or not arguments.json.exists() else load(arguments.json)
+    with tempfile.TemporaryDirectory() as folder:
+        work = arguments.work or Path(folder)
+        work.mkdir(parents=True, exist_ok=True)
+        places = [Place(found) for path in arguments.recordings for found in open_recordings(path)]
+        places += [room(work, number) for number in arguments.room]
+        for place in places:
+            for row in measured(place, arguments, work, {row.key for row in rows}):
+                rows.append(row)
+                show([row])
+                sys.stdout.flush()
+                if arguments.json is not None:
+                    save(arguments.json, rows)
+    print()
+    show(rows)
+
+
+def measured(place: Place, arguments: argparse.Namespace, work: Path, done: set[Key]) -> Iterator[Row]:
+    """The rows of a place that are not `done`."""
+    settings = load_settings().model_copy(update={"threads": 1})
+    if place.recording.categories is not None:
+        settings = settings.model_copy(update={"detector": "recorded"})
+    known = contestants(settings)
+    chosen = arguments.only.split(";") if arguments.only else [one.name for one in known]
+    measuring = Measuring(place, settings, work)
+    for count in map(int, arguments.keyframes.split(",")):
+        task = PaperPlan(place.recording).choose(count, arguments.queries, None, None)
+        for condition in arguments.conditions.split(","):
+            if condition == "night" and place.night is None:
+                continue
+            for contestant in known:
+                key = place.recording.name, count, condition, contestant.name
+                if contestant.name in chosen and key not in done:
+                    yield measuring.row(contestant, task, condition)
+
+
+def load(path: Path) -> list[Row]:
+    return [Row(**values) for values in json.loads(path.read_text())]
+
+
+def save(path: Path, rows: Sequence[Row]) -> None:
+    new = path.with_name(path.name + ".new")
+    new.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
+    new.replace(path)
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from semdb.landmarks.boxes import Box
 from semdb.landmarks.build import SeenKeyframe
 from semdb.landmarks.lift import SeenObject, lift_keyframe
 from semdb.landmarks.options import LandmarkOptions
+from semdb.perception.box_masks import box_mask, depth_cluster_mask
 from semdb.recordings.synthetic import SyntheticOptions, SyntheticSequence
 from semdb.recordings.synthetic.mistakes import MISNAMED, make_mistakes, with_misnamed
 from semdb.types import BoolArray, Camera, Float32Array, FloatArray, ImageArray
@@ -21,12 +22,14 @@ from semdb.types import BoolArray, Camera, Float32Array, FloatArray, ImageArray
 LEAST_SIDE = 0.03  # metres
 SMALLEST = 60  # pixels: a mask of fewer is none
 Rng = np.random.Generator
+MASK, BY_DEPTH, BOX = "masks", "boxes, by depth", "whole boxes"
 
 
 @dataclass(frozen=True, slots=True)
 class Mistakes:
     """What is spoiled: shares of objects missed and misnamed, share of masks cut (each loses 5 to 40 %), pose noise
-    (root mean square of its length and angle), and whether depth has a sensor's noise and holes.
+    (root mean square of its length and angle), and whether depth has a sensor's noise and holes. `shape` is what is
+    known of a mask: all of it, its box filled by depth, or its box alone.
     """
 
     missed: float = 0.0
@@ -35,6 +38,7 @@ class Mistakes:
     position_m: float = 0.0
     rotation_deg: float = 0.0
     depth_noise: bool = False
+    shape: str = MASK
 
 
 EXACT = Mistakes()
@@ -132,22 +136,31 @@ def seen_keyframes(
         rng = np.random.default_rng([room.seed, index, 11])
         seen = make_mistakes(frame.labels, room.classes, mistakes.missed, mistakes.confused, room.seed, index)
         objects, true = [], []
+        depth = frame.noisy if mistakes.depth_noise else frame.depth
         for label in np.unique(seen[seen > 0]).tolist():
             mask = seen == label
             if np.count_nonzero(mask) < SMALLEST:
                 continue
             if rng.random() < mistakes.cut:
                 mask = cut_mask(mask, rng)
-            objects.append(SeenObject(numbers[names[label]], 0.9, mask))
+            objects.append(SeenObject(numbers[names[label]], 0.9, shaped(mask, depth, mistakes.shape)))
             true.append(label % MISNAMED)
         pose = moved_pose(frame.pose, mistakes, rng)
-        depth = frame.noisy if mistakes.depth_noise else frame.depth
         lifted = lift_keyframe(room.camera, pose, depth, objects, options.lift, options.see)
         category = np.array([thing.category for thing in objects], np.int64)
         scores, colours = np.full(len(objects), 0.9), colours_of(frame.rgb, lifted)
         found.append(SeenKeyframe(lifted, category, scores, recording, colours=colours))
         labels.append(true)
     return found, labels
+
+
+def shaped(mask: BoolArray, depth: Float32Array, shape: str) -> BoolArray:
+    """What a detector knows of `mask` ``[H, W]`` that gives it so."""
+    if shape == MASK:
+        return mask
+    v, u = np.nonzero(mask)
+    box = np.array([u.min(), v.min(), u.max(), v.max()])
+    return box_mask(box, (mask.shape[0], mask.shape[1])) if shape == BOX else depth_cluster_mask(box, depth)
 
 
 def cut_mask(mask: BoolArray, rng: Rng) -> BoolArray:

@@ -285,7 +285,8 @@ def train_networks(
         if method.network is None:
             raise UsageError(f"--method {method.name}: networks that can be trained are {', '.join(NETWORKS)}")
         check_torch(method)
-    encoder = specs_for_ingest(settings, (), has_masks=False).encoder
+    # networks look at no objects: whoever trains them needs no detector
+    encoder = specs_for_ingest(settings.model_copy(update={"detector": "recorded"}), (), has_masks=True).encoder
     found = []
     for plan in (plan for path in paths for plan in paper_plans(path)):
         task = plan.choose(keyframes, max_queries, progress, say)

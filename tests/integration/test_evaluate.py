@@ -14,7 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 from sqlalchemy import Engine, text
+from typer.testing import CliRunner
 
+from semdb.cli.main import app
 from semdb.database.engine import make_engine
 from semdb.evaluation.workspace import _in_use, drop_abandoned, new_name, this_host
 from semdb.recordings.synthetic import SyntheticOptions, write_synthetic_recording
@@ -189,25 +191,61 @@ def test_the_ablation_has_a_row_for_every_layer(room: Path, tmp_path: Path) -> N
     assert set(by_name["hard"]["stages"]) == {"filtered"}  # the hard filter has the last word
 
 
-def test_networks_and_fixed_poses_have_a_table_and_pictures_and_networks_are_kept(room: Path, tmp_path: Path) -> None:
+def test_networks_are_trained_by_a_command_found_by_an_evaluation_and_have_a_table_and_pictures(
+    room: Path, tmp_path: Path
+) -> None:
     encoder = write_pooled_encoder(tmp_path / "encoder.onnx")
     asked = (room, "--keyframes", 6, "--max-queries", 2, "--encoder", f"onnx:{encoder}", "--pose-steps", 3)
-    methods = ("--method", "posenet", "--method", "posenet-keyframes", "--method", "mean-pose")
-    kept = ("--pose-networks", "networks", "--json", "r.json")
-    evaluate(*asked, *methods, *kept, "--report", "report", cwd=tmp_path)
-    first = read(tmp_path / "r.json")
-    assert [result["method"] for result in first] == ["posenet", "posenet-keyframes", "mean-pose"]
-    assert [result["success_rate"] for result in first] == [1.0, 1.0, 1.0]
-    assert first[1]["training_frames"] == 6 < first[0]["training_frames"]
-    assert first[2]["training_frames"] is None
-    assert first[0]["models"]["encoder"]["name"] == "onnx:encoder.onnx"
+    networks = ("--method", "posenet", "--method", "posenet-keyframes")
+    train = ("train", "pose", *asked, *networks, "--output", "networks")
+    done = semdb(*train, url=URL, cwd=tmp_path)
+    assert (done.returncode, "Traceback" in done.stderr) == (0, False), done.stderr
+    files = [Path("networks") / f"{room.name}-{name}-6-2.pth" for name in ("posenet", "posenet-keyframes")]
+    lines = done.stdout.splitlines()
+    assert [line.partition(": ")[0] for line in lines] == [str(file) for file in files]
+    assert lines[1].startswith(f"{files[1]}: 6 frames, loss ")
+    kept = [(tmp_path / file).read_bytes() for file in files]
+
+    evaluate(
+        *(*asked, *networks, "--method", "mean-pose", "--pose-networks", "networks", "--json", "r.json"),
+        *("--report", "report"),
+        cwd=tmp_path,
+    )
+    found = read(tmp_path / "r.json")
+    assert [(tmp_path / file).read_bytes() for file in files] == kept  # found, not trained
+    assert [result["method"] for result in found] == ["posenet", "posenet-keyframes", "mean-pose"]
+    assert [result["success_rate"] for result in found] == [1.0, 1.0, 1.0]
+    assert found[1]["training_frames"] == 6 < found[0]["training_frames"]
+    assert lines[0].startswith(f"{files[0]}: {found[0]['training_frames']} frames, loss ")
+    assert found[2]["training_frames"] is None
+    assert found[0]["models"]["encoder"]["name"] == "onnx:encoder.onnx"
     page = (tmp_path / "report" / "index.html").read_text()
     assert "Table 4 on the recordings of this run" in page
     assert (tmp_path / "report" / "training-1.png").is_file()
-    assert len(list((tmp_path / "networks").glob("*.pth"))) == 2
-    evaluate(*asked, *methods, *kept, cwd=tmp_path)  # found again, not trained
-    again = read(tmp_path / "r.json")
-    assert [result["mean_translation_m"] for result in again] == [result["mean_translation_m"] for result in first]
+
+
+def test_training_a_network_goes_on_only_where_it_is_told_to(room: Path, tmp_path: Path) -> None:
+    encoder = write_pooled_encoder(tmp_path / "encoder.onnx")
+
+    def run(*more: str, method: str = "posenet-keyframes") -> tuple[int, str]:
+        asked = [room, "--keyframes", "6", "--max-queries", "2", "--method", method, "--output", tmp_path / "networks"]
+        given = [*map(str, asked), "--encoder", f"onnx:{encoder}", "--pose-steps", "1", *more]
+        done = CliRunner().invoke(app, ["train", "pose", *given], env={"SEMDB_THREADS": "1"})
+        return done.exit_code, done.output
+
+    path = tmp_path / "networks" / f"{room.name}-posenet-keyframes-6-2.pth"
+    code, said = run("--resume")
+    assert (code, f"{path} is not there, so there is nothing to go on from" in said) == (2, True), said
+    code, said = run()
+    assert (code, f"{path}: 6 frames, loss " in said) == (0, True), said
+    kept = path.read_bytes()
+    code, said = run()
+    assert (code, f"{path} is there already: go on with --resume" in said) == (2, True), said
+    assert path.read_bytes() == kept
+    code, said = run("--resume")
+    assert (code, f"{path}: 6 frames, loss " in said) == (0, True), said
+    code, said = run(method="semdb")
+    assert (code, "--method semdb: networks that can be trained are posenet" in said) == (2, True), said
 
 
 def test_colmap_and_both_truths(room: Path, tmp_path: Path) -> None:

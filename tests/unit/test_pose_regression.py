@@ -19,7 +19,7 @@ from semdb.evaluation.regression import always, check_torch, fixed_pose, trainin
 from semdb.geometry import pose_error, pose_from
 from semdb.geometry.stacks import so3_exps
 from semdb.settings import Settings
-from semdb.training.pose import PoseData, load, rate_at, train
+from semdb.training.pose import PoseData, PoseRegressor, load, rate_at, train
 from semdb.training.pose_inputs import FrozenInputs, PixelInputs, depth_plane, make_inputs
 from semdb.training.pose_network import build, single
 from semdb.training.pose_options import PoseOptions
@@ -72,22 +72,41 @@ def test_the_loss_falls_and_the_poses_are_learnt(kind: str) -> None:
     assert np.median([angle for _, angle in errors]) < 0.75 * np.median([angle for _, angle in trivial])
 
 
-@pytest.mark.parametrize("stop", [7, 60, 68])
-def test_a_run_that_was_cut_off_ends_as_if_it_had_not_been(tmp_path: Path, stop: int) -> None:
-    options = replace(SMALL, kind="cnn-lstm", dropout=0.5)
-    data = some_data(window=3)
-    whole, again = (train(options, data, SETTINGS, checkpoint=tmp_path / name) for name in ("a.pth", "b.pth"))
-    assert whole.losses == again.losses
-    train(options, data, SETTINGS, checkpoint=tmp_path / "c.pth", stop_after=stop)
-    with pytest.raises(TrainingError, match=f"{stop} of 80 steps"):
-        load(tmp_path / "c.pth", data, options, SETTINGS)
+CUT = replace(SMALL, kind="cnn-lstm", dropout=0.5, steps=12, filter_steps=6)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[PoseRegressor, Path]:
+    """A run that nothing cut off."""
+    path = tmp_path_factory.mktemp("whole") / "a.pth"
+    return train(CUT, some_data(window=3), SETTINGS, checkpoint=path), path
+
+
+def test_equal_options_and_frames_make_an_equal_network(whole: tuple[PoseRegressor, Path], tmp_path: Path) -> None:
+    again = train(CUT, some_data(window=3), SETTINGS, checkpoint=tmp_path / "b.pth")
+    assert again.losses == whole[0].losses
+    assert_same_weights(whole[1], tmp_path / "b.pth")
+
+
+@pytest.mark.parametrize("stop", [5, 12, 15])
+def test_a_run_that_was_cut_off_ends_as_if_it_had_not_been(
+    whole: tuple[PoseRegressor, Path], tmp_path: Path, stop: int
+) -> None:
+    data, path = some_data(window=3), tmp_path / "c.pth"
+    train(CUT, data, SETTINGS, checkpoint=path, stop_after=stop)
+    with pytest.raises(TrainingError, match=f"{stop} of 18 steps"):
+        load(path, data, CUT, SETTINGS)
     torch.manual_seed(stop)
-    done = train(options, data, SETTINGS, checkpoint=tmp_path / "c.pth", resume=True)
-    assert done.losses == whole.losses
-    a, c = (torch.load(tmp_path / name, weights_only=True)["model"] for name in ("a.pth", "c.pth"))
-    assert all(torch.equal(a[name], c[name]) for name in a)
-    read = load(tmp_path / "c.pth", data, options, SETTINGS)
-    assert np.array_equal(read.predict(data.inputs[:3]), whole.predict(data.inputs[:3]))
+    done = train(CUT, data, SETTINGS, checkpoint=path, resume=True)
+    assert done.losses == whole[0].losses
+    assert_same_weights(whole[1], path)
+    read = load(path, data, CUT, SETTINGS)
+    assert np.array_equal(read.predict(data.inputs[:3]), whole[0].predict(data.inputs[:3]))
+
+
+def assert_same_weights(one: Path, other: Path) -> None:
+    a, b = (torch.load(path, weights_only=True)["model"] for path in (one, other))
+    assert all(torch.equal(a[name], b[name]) for name in a)
 
 
 def test_checkpoints_of_something_else_are_refused(tmp_path: Path) -> None:
