@@ -76,7 +76,7 @@ def command(
 ) -> None:
     """Select keyframes, describe them and store them. Running it again adds nothing; cut off, it goes on."""
     from semdb.cli.output import print_json, print_lines
-    from semdb.cli.progress import StagedProgress
+    from semdb.cli.progress import OF_TRAJECTORIES, StagedProgress
     from semdb.errors import UsageError
     from semdb.events import log_to
     from semdb.recordings.options import option_of
@@ -107,7 +107,7 @@ def command(
         raise UsageError("name the folder of a recording: semdb ingest PATH (or --resume for what workers have left)")
     if queue and align:
         raise UsageError("--align needs keyframes, which --queue leaves to workers: run semdb align when they are done")
-    with StagedProgress() as progress, ends_when_told(), open_database(settings) as database:
+    with StagedProgress(OF_TRAJECTORIES) as progress, ends_when_told(), open_database(settings) as database:
         work = partial(database.queue, paths, _send()) if queue else partial(database.ingest, paths, align=align)
         summaries = work(
             map=map_name,

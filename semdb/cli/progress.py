@@ -11,6 +11,7 @@ from typing import Any, Self, TextIO
 from semdb.shown import for_terminal, measure
 
 SECONDS_BETWEEN_LINES = 5.0
+OF_TRAJECTORIES = {"closing loops": "pairs", "bundle adjustment": "rounds"}  # what is counted, where it is not frames
 LEAST_FOR_TIME_LEFT = 3  # so many after the first one; they may be steps of minutes, so not more
 
 
@@ -98,12 +99,12 @@ def _rich_bar(stream: TextIO) -> Any:
 class StagedProgress:
     """Progress of work in several stages: a bar for each stage that is named, one after the other.
 
-    `units` says by stage what is counted, where it is not frames.
+    `units` says by stage what is counted, where it is not the `usual`.
     """
 
-    def __init__(self, units: Mapping[str, str] | None = None) -> None:
+    def __init__(self, units: Mapping[str, str] | None = None, usual: str = "frames") -> None:
         self._label = ""
-        self._units = dict(units or {})
+        self._units, self._usual = dict(units or {}), usual
         self._current: Progress | None = None
 
     def __enter__(self) -> Self:
@@ -124,7 +125,7 @@ class StagedProgress:
         if label != self._label or self._current is None:
             self._end()
             self._label = label
-            self._current = Progress(label, self._units.get(label, "frames")).__enter__()
+            self._current = Progress(label, self._units.get(label, self._usual)).__enter__()
         self._current.update(done, total)
 
 

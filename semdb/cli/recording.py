@@ -94,8 +94,7 @@ def check_lines(report: Report | None) -> list[str]:
 
 def compare(recording: Recording) -> PoseComparison | str:
     """Recorded poses beside estimated ones, or why there is nothing to compare."""
-    from semdb.cli.progress import StagedProgress
-    from semdb.cli.trajectory import UNITS
+    from semdb.cli.progress import OF_TRAJECTORIES, StagedProgress
     from semdb.errors import RecordingError
     from semdb.evaluation.pose_comparison import compare_poses
     from semdb.trajectory.recording import find_recorded
@@ -103,7 +102,7 @@ def compare(recording: Recording) -> PoseComparison | str:
     if all(entry.world_from_camera is None for entry in recording.entries):
         return "no poses are recorded: semdb trajectory estimates them"
     try:
-        with StagedProgress(UNITS) as progress:
+        with StagedProgress(OF_TRAJECTORIES) as progress:
             return compare_poses(find_recorded(recording, progress=progress.update))
     except RecordingError as error:
         return str(error)

@@ -45,7 +45,7 @@ def command(
         names = [map_name] if map_name is not None else [info.name for info in database.maps() if info.keyframes]
         for name in names:
             try:
-                with StagedProgress() as progress:
+                with StagedProgress(usual="steps") as progress:
                     results = database.refine(name, steps=step or (), force=force, progress=progress.update)
             except SemdbError as error:
                 if len(names) == 1 or isinstance(error, DatabaseUnavailableError):

@@ -15,11 +15,11 @@ from semdb.shown import measure
 
 if TYPE_CHECKING:
     from semdb.perception.protocols import Encoder as PlaceEncoder
+    from semdb.pictures.trajectory import ShownClosure
     from semdb.recordings.base import Recording
     from semdb.trajectory.recording import RecordedTrajectory
 
 REASONS_SHOWN = 5
-UNITS = {"closing loops": "pairs", "bundle adjustment": "rounds"}  # what is counted, where it is not frames
 
 
 @reading_options()
@@ -43,7 +43,7 @@ def command(
 
     No model file is needed; a place encoder may be given to propose loop closures.
     """
-    from semdb.cli.progress import StagedProgress, say
+    from semdb.cli.progress import OF_TRAJECTORIES, StagedProgress, say
     from semdb.recordings import open_recording, parse_camera
     from semdb.recordings.dropped import lines_of_opening
     from semdb.trajectory.recording import find_recorded
@@ -54,7 +54,7 @@ def command(
         say(line)
     chosen = encoder_of(encoder)
     started = time.perf_counter()
-    with StagedProgress(UNITS) as progress:
+    with StagedProgress(OF_TRAJECTORIES) as progress:
         found = find_recorded(recording, every=every, encoder=chosen, progress=progress.update)
     seconds = time.perf_counter() - started
     write(found, recording, seconds, out, json_file, plot)
@@ -132,31 +132,38 @@ def picture_of(found: RecordedTrajectory, recording: Recording) -> bytes:
     """The path from above as a PNG file."""
     import numpy as np
 
-    from semdb.pictures.trajectory import ShownClosure, draw_trajectory
+    from semdb.pictures.trajectory import draw_trajectory
     from semdb.recordings.images import encode_color
-    from semdb.trajectory.edges import EdgeState
 
-    trajectory = found.trajectory
-    used = trajectory.used
-    place = {frame.position: n for n, frame in enumerate(used)}
-    drifts = {(drift.first, drift.second): drift for drift in trajectory.drifts}
-    closures = []
-    for edge in (*trajectory.closures(), *trajectory.closures(EdgeState.CONTRADICTED)):
-        ends = [place.get(trajectory.keyframes[number]) for number in (edge.first, edge.second)]
-        drift = drifts.get((edge.first, edge.second))
-        if ends[0] is not None and ends[1] is not None:
-            metres, degrees = (0.0, 0.0) if drift is None else (drift.metres, drift.degrees)
-            closures.append(ShownClosure(ends[0], ends[1], metres, degrees, edge.state is EdgeState.ACCEPTED))
+    used = found.trajectory.used
     true = [found.entries[frame.position].world_from_camera for frame in used]
     image = draw_trajectory(
         np.stack([frame.before_closing for frame in used if frame.before_closing is not None]),
         np.stack([frame.world_from_camera for frame in used if frame.world_from_camera is not None]),
-        [place[frame.position] for frame in used if frame.keyframe >= 0],
-        closures,
+        [n for n, frame in enumerate(used) if frame.keyframe >= 0],
+        shown_closures(found),
         title=f"{recording.name}: the path from above",
         true=np.stack([pose for pose in true if pose is not None]) if all(p is not None for p in true) else None,
     )
     return encode_color(image)
+
+
+def shown_closures(found: RecordedTrajectory) -> list[ShownClosure]:
+    """Closures between frames of the largest piece, named by these; contradicted ones have no drift."""
+    from semdb.pictures.trajectory import ShownClosure
+    from semdb.trajectory.edges import EdgeState
+
+    trajectory = found.trajectory
+    place = {frame.position: n for n, frame in enumerate(trajectory.used)}
+    drifts = {(drift.first, drift.second): (drift.metres, drift.degrees) for drift in trajectory.drifts}
+    shown = []
+    for edge in (*trajectory.closures(), *trajectory.closures(EdgeState.CONTRADICTED)):
+        first, second = (trajectory.keyframes[number] for number in (edge.first, edge.second))
+        if first in place and second in place:
+            off = drifts.get((edge.first, edge.second), (0.0, 0.0))
+            name = f"{found.entries[first].index}-{found.entries[second].index}"
+            shown.append(ShownClosure(place[first], place[second], *off, edge.state is EdgeState.ACCEPTED, name))
+    return shown
 
 
 def print_summary(found: RecordedTrajectory, recording: Recording, seconds: float) -> None:

@@ -25,13 +25,17 @@ BEFORE, AFTER, CLOSURE, REFUSED, TRUE = "#9aa5b1", "#2f6fd0", "#1e8e4e", "#c0322
 
 @dataclass(frozen=True, slots=True)
 class ShownClosure:
-    """A closure between two positions of the path: how far odometry was off there, and whether it counts."""
+    """A closure between two positions of the path: how far odometry was off there, and whether it counts.
+
+    `name` says between which frames, for people; without one it is the positions.
+    """
 
     first: int
     second: int
     metres: float
     degrees: float
     accepted: bool = True
+    name: str = ""
 
 
 def draw_trajectory(
@@ -46,30 +50,31 @@ def draw_trajectory(
     """The picture as RGB ``[H, W, 3]``.
 
     `before` and `after` ``[n, 4, 4]`` are the same frames by odometry alone and in the end; `keyframes` and the
-    positions of `closures` count them. `true` ``[n, 4, 4]`` are their recorded poses where there are some.
+    positions of `closures` count them. `true` ``[n, 4, 4]`` are their recorded poses where there are some, laid on each
+    path as well as one motion can.
     """
     figure = Figure(figsize=(SIZE[0] / DPI, SIZE[1] / DPI), dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
     ground = horizontal_axes(after)
     laid = after[0] @ invert_pose(before[0]) @ before
-    paths = [laid, after] if true is None else [laid, after, _laid_on(true, after)]
-    corners = np.concatenate([path[:, :3, 3] @ ground.T for path in paths])
+    recorded = [] if true is None else [_laid_on(true, path) for path in (laid, after)]
+    corners = np.concatenate([path[:, :3, 3] @ ground.T for path in (laid, after, *recorded)])
     panels = ((0.03, laid, BEFORE, "odometry alone"), (0.515, after, AFTER, "loops closed, all keyframes adjusted"))
-    for left, path, colour, name in panels:
+    for number, (left, path, colour, name) in enumerate(panels):
         axes = figure.add_axes((left, 0.36, *PANEL))
         _draw_path(axes, path, ground, colour, keyframes)
         _draw_closures(axes, path, ground, closures)
-        if true is not None:
-            _draw_line(axes, paths[2], ground, TRUE, 0.8, "recorded", (0, (4, 2)))
+        if recorded:
+            _draw_line(axes, recorded[number], ground, TRUE, 0.8, "recorded", (0, (4, 2)))
         _frame(axes, corners, name)
     _draw_drifts(figure.add_axes((0.06, 0.09, 0.9, 0.19)), closures)
     figure.text(0.012, 0.965, for_plot(title), color=INK, fontsize=15, weight="bold", va="center")
     return figure_to_image(figure)
 
 
-def _laid_on(true: FloatArray, after: FloatArray) -> FloatArray:
-    """Recorded poses moved so that they lie on the estimated ones as well as they can."""
-    positions, target = true[:, :3, 3], after[:, :3, 3]
+def _laid_on(true: FloatArray, path: FloatArray) -> FloatArray:
+    """Recorded poses moved so that they lie on estimated ones as well as they can."""
+    positions, target = true[:, :3, 3], path[:, :3, 3]
     u, _, vt = np.linalg.svd((target - target.mean(axis=0)).T @ (positions - positions.mean(axis=0)))
     rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
     motion = np.eye(4)
@@ -88,11 +93,15 @@ def _draw_line(
 def _draw_path(axes: Axes, path: FloatArray, ground: FloatArray, colour: str, keyframes: Sequence[int]) -> None:
     _draw_line(axes, path, ground, colour, 1.6, "path")
     x, y = (path[list(keyframes), :3, 3] @ ground.T).T
-    axes.scatter(x, y, s=16, color=colour, label=f"{len(keyframes)} keyframes", zorder=4)
+    axes.scatter(x, y, s=16, color=colour, label=_counted(len(keyframes), "keyframe"), zorder=4)
     start = path[0, :3, 3] @ ground.T
     axes.scatter(
         [start[0]], [start[1]], s=70, facecolors="none", edgecolors=INK, linewidths=1.4, label="start", zorder=5
     )
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
 
 
 def _draw_closures(axes: Axes, path: FloatArray, ground: FloatArray, closures: Sequence[ShownClosure]) -> None:
@@ -101,7 +110,7 @@ def _draw_closures(axes: Axes, path: FloatArray, ground: FloatArray, closures: S
         if not shown:
             continue
         ends = np.array([[path[c.first, :3, 3] @ ground.T, path[c.second, :3, 3] @ ground.T] for c in shown])
-        label = f"{len(shown)} closures" if accepted else f"{len(shown)} contradicted"
+        label = _counted(len(shown), "closure") if accepted else f"{len(shown)} contradicted"
         axes.add_collection(LineCollection(list(ends), colors=colour, linewidths=0.9, alpha=0.7, label=label))
 
 
@@ -123,9 +132,8 @@ def _frame(axes: Axes, corners: FloatArray, name: str) -> None:
 
 def _draw_drifts(axes: Axes, closures: Sequence[ShownClosure]) -> None:
     shown = [closure for closure in closures if closure.accepted]
-    axes.set_title(
-        "drift of odometry that each closure shows, in the order of the later frame", color=INK, fontsize=12, loc="left"
-    )
+    title = "drift of odometry that each closure (frame-frame) shows, in the order of the later one"
+    axes.set_title(title, color=INK, fontsize=12, loc="left")
     for spine in ("top", "right"):
         axes.spines[spine].set_visible(False)
     axes.tick_params(colors=FAINT, labelsize=9)
@@ -138,4 +146,5 @@ def _draw_drifts(axes: Axes, closures: Sequence[ShownClosure]) -> None:
     places = np.arange(len(order))
     axes.bar(places, [100 * closure.metres for closure in order], color=CLOSURE, width=0.6)
     step = max(1, len(order) // 24)
-    axes.set_xticks(places[::step], [f"{c.first}-{c.second}" for c in order[::step]], rotation=40, ha="right")
+    names = [for_plot(c.name or f"{c.first}-{c.second}") for c in order[::step]]
+    axes.set_xticks(places[::step], names, rotation=40, ha="right")

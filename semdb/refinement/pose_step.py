@@ -21,7 +21,7 @@ from semdb.localization.views import ClassNumbers, make_view
 from semdb.recordings.images import decode_color_grey
 from semdb.trajectory.depth_views import DepthView, depth_view
 from semdb.trajectory.keyframes import Keyframe, Keyframes, sample_of, with_points_only
-from semdb.trajectory.refining import PoseOptions, between_recordings, refine_keyframes
+from semdb.trajectory.refining import LOOKING, PoseOptions, between_recordings, refine_keyframes
 from semdb.types import FloatArray, ImageArray
 
 KIND = "poses"
@@ -66,9 +66,12 @@ class PoseStep:
         keyframes, known = _load(store, listed, progress)
         recordings = [one.recording_id for one in known]
         first = [n == 0 or recordings[n] != recordings[n - 1] for n in range(len(known))]
-        found = refine_keyframes(
-            keyframes, first, self.options, lambda _what, done, total: progress(total + done, 2 * total)
-        )
+
+        def told(what: str, done: int, total: int) -> None:
+            before, share = (10, 50) if what == LOOKING else (60, 40)
+            progress(before + share * done // max(total, 1), 100)
+
+        found = refine_keyframes(keyframes, first, self.options, told)
         edges = between_recordings(found.closures, recordings)
         spread = {one.id: found.covariances[n] for n, one in enumerate(known)}
         return PoseResult(
@@ -115,7 +118,7 @@ def _load(
     numbers, keyframes, known = ClassNumbers(), Keyframes(), list[StoredKeyframe]()
     starts: dict[int, float] = {}
     for done, key in enumerate(listed, 1):
-        progress(done, 2 * len(listed))
+        progress(10 * done // len(listed), 100)
         found = store.load_keyframes([key], bad=store.left_out)
         ids, vectors = store.vectors_there(np.array([key], np.int64), bad=store.left_out)
         if not found or not len(ids):

@@ -26,6 +26,7 @@ from semdb.types import FloatArray
 
 Progress = Callable[[str, int, int], None]
 DRIFT = StepNoise(0.003, 0.02, 0.003, 0.02)
+LOOKING = "looking for closures"  # what progress is told of
 UNSURE = 1e4  # times the variance of a step: between recordings, whose frames need not be the same to a centimetre
 
 
@@ -76,7 +77,7 @@ def refine_keyframes(
     search = ClosureSearch(keyframes, options.trajectory)
     solution, closures = Solution(given, world), list[Edge]()
     for _ in range(options.rounds):
-        search.look(sorted({*search.alike(), *search.near(world)}), _told(progress, "looking for closures"))
+        search.look(sorted({*search.alike(), *search.near(world)}), _told(progress, LOOKING))
         closures = consistent(search.edges, chain, options.trajectory.consistency)
         accepted = [edge for edge in closures if edge.state is EdgeState.ACCEPTED]
         solution = solve_graph(solution.poses, world, [*odometry, *accepted])

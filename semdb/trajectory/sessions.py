@@ -191,6 +191,8 @@ def convinces(
     """
     options = options or SessionOptions()
     agreeing, claims = len(consensus.agreeing), len(consensus.edges)
+    if not claims:
+        return "none of its keyframes is localized there"
     if agreeing < options.least_agreeing:
         return f"only {agreeing} of {claims} localized keyframes agree where it lies; it takes {options.least_agreeing}"
     if consensus.confidence < options.sure or consensus.likeness < options.alike:

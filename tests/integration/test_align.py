@@ -11,8 +11,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import Result
+from typer.testing import CliRunner
 
 from semdb.api import Answer, Database
+from semdb.cli.main import app
 from semdb.database.moving import move
 from semdb.database.pose_records import Move, OperationKind
 from semdb.errors import DatabaseError, NotFoundError, UsageError
@@ -21,10 +24,11 @@ from semdb.recordings import open_recordings
 from semdb.recordings.base import Recording
 from semdb.types import FloatArray
 from tests.integration.opened import Opening, opener
-from tests.rooms import SMALL, render, semdb
+from tests.rooms import SMALL, environment, render
 
 MOTION = pose_from(so3_exp([0.4, -1.0, 2.0]), [7.0, -3.0, 1.5])
 WALK = replace(SMALL, frames=40, lap_frames=40)
+SPARSE = replace(WALK, frames=14, lap_frames=13)  # about every third frame of it
 
 
 def part(path: Path, name: str, chosen: slice, motion: FloatArray = MOTION) -> Recording:
@@ -39,8 +43,8 @@ def rooms(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("rooms")
     return {
         "room": render(folder / "room", WALK),
-        "alike": render(folder / "alike", replace(WALK, alike=True)),
-        "furniture": render(folder / "furniture", replace(WALK, furniture_seed=5)),
+        "alike": render(folder / "alike", replace(SPARSE, alike=True)),
+        "furniture": render(folder / "furniture", replace(SPARSE, furniture_seed=5)),
     }
 
 
@@ -52,13 +56,13 @@ def filled(rooms: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> 
         db = opening()
         fill(db, rooms)
         for name in ("alike", "furniture"):
-            db.ingest(part(rooms[name], name, slice(0, 40, 3)), map=name, stride=1, check=False)
+            db.ingest(part(rooms[name], name, slice(None)), map=name, stride=1, check=False)
     return url
 
 
-def fill(db: Database, rooms: dict[str, Path]) -> None:
-    db.ingest(part(rooms["room"], "first", slice(0, 40, 3), np.eye(4)), map="room", stride=1, check=False)
-    db.ingest(part(rooms["room"], "second", slice(1, 40, 4)), map="own", stride=1, check=False)
+def fill(db: Database, rooms: dict[str, Path], frames: int = 40) -> None:
+    db.ingest(part(rooms["room"], "first", slice(0, frames, 3), np.eye(4)), map="room", stride=1, check=False)
+    db.ingest(part(rooms["room"], "second", slice(1, frames, 4)), map="own", stride=1, check=False)
 
 
 @pytest.fixture
@@ -124,42 +128,47 @@ def test_a_room_that_looks_alike_is_refused_both_ways(db: Database, name: str) -
     assert all(np.array_equal(b[key], a[key]) for b, a in zip(before, after, strict=True) for key in b)
 
 
-def test_the_command(filled: str, tmp_path: Path) -> None:
+def test_the_command(filled: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     copy = tmp_path / "semdb.sqlite3"
     copy.write_bytes(Path(filled.removeprefix("sqlite:///")).read_bytes())
-    url = f"sqlite:///{copy}"
-    dry = semdb("align", "second", "--map", "room", "--dry-run", url=url)
-    assert dry.returncode == 0, dry.stderr
+    for name, value in environment(f"sqlite:///{copy}", SEMDB_CACHE_DIR=str(tmp_path)).items():
+        monkeypatch.setenv(name, value)
+
+    def run(*arguments: str) -> Result:
+        return CliRunner().invoke(app, ["align", *arguments])
+
+    dry = run("second", "--map", "room", "--dry-run")
+    assert dry.exit_code == 0, dry.stderr
     assert dry.stdout.count("second/") == 10
     assert "would move from own to room; nothing is changed" in dry.stdout
     assert "shift m" in dry.stdout
-    tried = semdb("align", "second", "--map", "room", "--dry-run", "--joint", "--json", url=url)
+    tried = run("second", "--map", "room", "--dry-run", "--joint", "--json")
     shown = json.loads(tried.stdout)
     assert (shown["convinced"], shown["moved"]) == (True, False)
     assert 0 < shown["map_shift_m"] < 0.005
     apart = [one["shift_m"] for one in shown["keyframes"]]  # MOTION, of this recording
     assert np.median(apart) > 0.5
-    refused = semdb("align", "alike", "--map", "room", url=url)
-    assert refused.returncode == 1
+    refused = run("alike", "--map", "room")
+    assert refused.exit_code == 1
     assert "not moved: " in refused.stdout
     assert "nothing is changed" in refused.stdout
-    named = semdb("align", "second", "--map", "room", "--name", "first", url=url)
-    assert named.returncode == 2
+    named = run("second", "--map", "room", "--name", "first")
+    assert named.exit_code == 2
     assert "the map 'room' has a recording 'first' already: give this one another name with --name" in named.stderr
-    done = semdb("align", "second", "--map", "room", "--name", "evening", "--json", url=url)
-    assert done.returncode == 0, done.stderr
+    done = run("second", "--map", "room", "--name", "evening", "--json")
+    assert done.exit_code == 0, done.stderr
     found = json.loads(done.stdout)
     assert (found["convinced"], found["moved"], found["agreeing"]) == (True, True, 10)
     assert {one["verdict"] for one in found["keyframes"]} == {"localized"}
-    assert "evening" in semdb("status", url=url).stdout
-    back = semdb("align", "evening", "--undo", url=url)
-    assert back.returncode == 0, back.stderr
+    assert "evening" in CliRunner().invoke(app, ["status"]).stdout
+    back = run("evening", "--undo")
+    assert back.exit_code == 0, back.stderr
     assert "took back: second is in the map own again, its poses are what they were" in back.stdout
-    again = semdb("align", "second", "--undo", url=url)
-    assert again.returncode == 2
+    again = run("second", "--undo")
+    assert again.exit_code == 2
     assert "nothing has moved the recording 'second', or all of it was taken back" in again.stderr
-    assert semdb("align", "second", url=url).returncode == 2
-    assert "--undo takes no --name" in semdb("align", "second", "--undo", "--name", "x", url=url).stderr
+    assert run("second").exit_code == 2
+    assert "--undo takes no --name" in run("second", "--undo", "--name", "x").stderr
 
 
 def test_maps_are_merged_and_the_map_may_move_too(db: Database) -> None:
@@ -193,7 +202,7 @@ def test_recordings_that_moved_with_the_map_are_taken_back_before_it(db: Databas
 def test_a_map_that_is_refined_while_it_is_aligned_with_is_noticed(open_db: Opening, rooms: dict[str, Path]) -> None:
     """Between looking and moving another process moves the map's keyframes: nothing of the alignment is written."""
     db = open_db()
-    fill(db, rooms)
+    fill(db, rooms, 20)
     before = poses(db, "own", "second")
     store = db._store()
     kept = {one.id: one.world_from_camera for one in db.keyframes("room")}

@@ -7,22 +7,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from semdb.cli.trajectory import named
+from semdb.cli.trajectory import named, shown_closures
 from semdb.evaluation.pose_comparison import compare_poses
 from semdb.evaluation.trajectory_errors import rigid_alignment, trajectory_errors
 from semdb.geometry import invert_pose, pose_error, pose_from, so3_exp, transform_points
 from semdb.geometry.stacks import adjoints
 from semdb.geometry.volumes import Volume, common_view, common_views
+from semdb.pictures.trajectory import ShownClosure
 from semdb.recordings.base import FrameEntry
 from semdb.recordings.synthetic import SyntheticOptions
 from semdb.recordings.synthetic.writer import SyntheticSequence
 from semdb.trajectory.depth_views import depth_agreement, depth_view
+from semdb.trajectory.edges import Edge, EdgeKind, EdgeState
 from semdb.trajectory.files import trajectory_text
 from semdb.trajectory.measuring import joined
 from semdb.trajectory.motion import Motion, turn_rates
 from semdb.trajectory.odometry import FrameState
 from semdb.trajectory.recording import RecordedTrajectory
-from semdb.trajectory.result import FramePose, PieceSummary, Trajectory
+from semdb.trajectory.result import Drift, FramePose, PieceSummary, Trajectory
 from semdb.types import Camera, FloatArray
 
 
@@ -213,6 +215,24 @@ def test_files_have_the_times_of_the_recording() -> None:
     untimed = trajectory_text(RecordedTrajectory(trajectory, (entry,), False))
     assert "frame index" in untimed.splitlines()[1]
     assert untimed.splitlines()[3].startswith("7.000000000 ")
+
+
+def test_closures_are_shown_by_their_frames() -> None:
+    """Of every second frame, the first of which is lost: drawn are frames with a pose."""
+    frames = (
+        FramePose(0, FrameState.LOST),
+        *(FramePose(n, FrameState.TRACKED, piece=0, world_from_camera=np.eye(4)) for n in (1, 2, 3)),
+    )
+    made = [
+        Edge(0, 2, EdgeKind.LOOP, np.eye(4), np.eye(6), 50),
+        Edge(1, 2, EdgeKind.LOOP, np.eye(4), np.eye(6), 30, EdgeState.CONTRADICTED, "contradicts 1 of 1"),
+    ]
+    trajectory = Trajectory(frames, (1, 2, 3), tuple(made), (), (Drift(0, 2, 0.03, 1.5, 2.0),), 0.0, {})
+    entries = tuple(FrameEntry(2 * n, f"{n}.png", None, Path(f"{n}.png"), None, None, None) for n in range(4))
+    assert shown_closures(RecordedTrajectory(trajectory, entries, False)) == [
+        ShownClosure(0, 2, 0.03, 1.5, True, "2-6"),
+        ShownClosure(1, 2, 0.0, 0.0, False, "4-6"),
+    ]
 
 
 # recorded poses beside estimated ones
