@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
@@ -11,13 +11,21 @@ from semdb.client.writing import Writing
 
 if TYPE_CHECKING:
     from semdb.client.tracking import RemoteTracker
-    from semdb.database.records import Deleted, MapInfo, RecordingStatus
+    from semdb.database.jobs import Job
+    from semdb.database.landmark_reading import StoredLandmark, StoredRelation
+    from semdb.database.landmark_records import LandmarkVisit
+    from semdb.database.query_log import LoggedQuery
+    from semdb.database.records import Deleted, FailedItem, MapInfo, RecordingStatus, StoredImage
+    from semdb.database.scene_reading import StoredSighting
     from semdb.door.changed import Changes
     from semdb.door.found import Found
     from semdb.door.links import KeyframeLink
     from semdb.door.tracked import Tracked
     from semdb.door.values import Answer, Keyframe, Rows
     from semdb.ingestion.run import IngestSummary
+    from semdb.localization.coverage import Coverage
+    from semdb.pictures.cloud import Cloud
+    from semdb.recordings.base import Recording
     from semdb.types import ModelInfo
 
 T = TypeVar("T")
@@ -133,9 +141,81 @@ class AsyncDatabase:
             await self._run(getattr, keyframe, name)
         return keyframe
 
-    async def loops(self, map: str | None = None, *, odometry: bool = False) -> list[KeyframeLink]:
+    async def loops(self, map: str | None = None, **options: Any) -> list[KeyframeLink]:
         """As `RemoteDatabase.loops`."""
-        return await self._run(self.database.loops, map, odometry=odometry)
+        return await self._run(self.database.loops, map, **options)
+
+    async def has_recording(self, name: str, map: str | None = None) -> bool:
+        """As `RemoteDatabase.has_recording`."""
+        return await self._run(self.database.has_recording, name, map)
+
+    async def check_keyframes(self, ids: Iterable[int]) -> None:
+        """As `RemoteDatabase.check_keyframes`."""
+        await self._run(self.database.check_keyframes, ids)
+
+    async def keyframe_files(self, keyframe_id: int) -> StoredImage:
+        """As `RemoteDatabase.keyframe_files`."""
+        return await self._run(self.database.keyframe_files, keyframe_id)
+
+    async def landmarks(self, map: str, **options: Any) -> list[StoredLandmark]:
+        """As `RemoteDatabase.landmarks`."""
+        return await self._run(self.database.landmarks, map, **options)
+
+    async def relations(self, map: str, **options: Any) -> list[StoredRelation]:
+        """As `RemoteDatabase.relations`."""
+        return await self._run(self.database.relations, map, **options)
+
+    async def up(self, map: str) -> tuple[float, float, float] | None:
+        """As `RemoteDatabase.up`."""
+        return await self._run(self.database.up, map)
+
+    async def coverage(self, map: str, position: Sequence[float] | None = None, *, radius_m: float = 2.0) -> Coverage:
+        """As `RemoteDatabase.coverage`."""
+        return await self._run(self.database.coverage, map, position, radius_m=radius_m)
+
+    async def sightings(self, map: str, landmark: int) -> list[StoredSighting]:
+        """As `RemoteDatabase.sightings`."""
+        return await self._run(self.database.sightings, map, landmark)
+
+    async def visits(self, map: str, landmark: int) -> list[LandmarkVisit]:
+        """As `RemoteDatabase.visits`."""
+        return await self._run(self.database.visits, map, landmark)
+
+    async def seen_in(self, keyframe_id: int) -> list[StoredSighting]:
+        """As `RemoteDatabase.seen_in`."""
+        return await self._run(self.database.seen_in, keyframe_id)
+
+    async def scene(self, map: str) -> dict[str, Any]:
+        """As `RemoteDatabase.scene`."""
+        return await self._run(self.database.scene, map)
+
+    async def cloud(self, map: str, points: int = 100_000) -> Cloud:
+        """As `RemoteDatabase.cloud`."""
+        return await self._run(self.database.cloud, map, points)
+
+    async def queries(self, map: str, **options: Any) -> list[LoggedQuery]:
+        """As `RemoteDatabase.queries`."""
+        return await self._run(self.database.queries, map, **options)
+
+    async def query(self, query_id: int) -> tuple[str, LoggedQuery]:
+        """As `RemoteDatabase.query`."""
+        return await self._run(self.database.query, query_id)
+
+    async def failures(self, recording: str, map: str) -> list[FailedItem]:
+        """As `RemoteDatabase.failures`."""
+        return await self._run(self.database.failures, recording, map)
+
+    async def job(self, job_id: int) -> Job:
+        """As `RemoteDatabase.job`."""
+        return await self._run(self.database.job, job_id)
+
+    async def jobs(self, map: str | None = None, **options: Any) -> list[Job]:
+        """As `RemoteDatabase.jobs`."""
+        return await self._run(self.database.jobs, map, **options)
+
+    async def open_recording(self, recording: Any, **options: Any) -> Recording:
+        """As `RemoteDatabase.open_recording`."""
+        return await self._run(self.database.open_recording, recording, **options)
 
     async def find(self, what: str, **options: Any) -> Found:
         """As `RemoteDatabase.find`."""

@@ -8,7 +8,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
-from semdb.client.reading import Reading
+from semdb.client.surveying import Surveying
 from semdb.client.transport import segment
 from semdb.door.values import Answer
 from semdb.errors import FrameError, UsageError
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from semdb.types import Camera
 
 
-class Localizing(Reading):
+class Localizing(Surveying):
     """Says where images were taken: they are read here, and sent."""
 
     @overload

@@ -84,7 +84,7 @@ class Reading:
         """The keyframe with that id. Raises NotFoundError."""
         from semdb.client.values import keyframe_of
 
-        return keyframe_of(self._get(f"/v1/keyframes/{_key(keyframe_id)}"), self._content)
+        return keyframe_of(self._get(f"/v1/keyframes/{key_of(keyframe_id)}"), self._content)
 
     def keyframes(
         self,
@@ -110,16 +110,30 @@ class Reading:
         found = self._pages(path, limit, recording=recording, after=max(0, int(after)))
         return [keyframe_of(one, self._content) for one in found]
 
-    def loops(self, map: str | None = None, *, odometry: bool = False) -> list[KeyframeLink]:
-        """What ties keyframes of a map, or of all, together: closures, and with `odometry` what follows each other."""
+    def loops(
+        self,
+        map: str | None = None,
+        *,
+        odometry: bool = False,
+        after: tuple[int, int, str] | None = None,
+        limit: int | None = None,
+    ) -> list[KeyframeLink]:
+        """What ties keyframes of a map, or of all, together: closures, and with `odometry` what follows each other.
+
+        By the ids of both keyframes and kind, with `limit` so many of those after such a key. Raises NotFoundError.
+        """
         from semdb.client.values import link_of
 
         names = [info.name for info in self.maps()] if map is None else [map]
-        return [
-            link_of(one)
-            for name in names
-            for one in self._pages(f"/v1/maps/{segment(name)}/loops", odometry=odometry or None)
+        asked = {
+            "odometry": odometry or None,
+            "after": None if after is None else "-".join(str(part) for part in after),
+        }
+        found = [
+            link_of(one) for name in names for one in self._pages(f"/v1/maps/{segment(name)}/loops", limit, **asked)
         ]
+        found.sort(key=lambda one: (one.keyframe, one.other_keyframe, one.kind))
+        return found if limit is None else found[:limit]
 
     def find(
         self,
@@ -145,7 +159,7 @@ class Reading:
             seen_after = seen_after.isoformat()
         elif isinstance(seen_after, int):
             seen_after = f"{max(0, seen_after):019d}"  # of so many digits it is nanoseconds
-        place = {} if origin is None else dict(zip("xyz", _three(origin), strict=True))
+        place = {} if origin is None else dict(zip("xyz", three(origin), strict=True))
         given = {"near": near, "on": on, "not_near": not_near, "map": map, "seen_after": seen_after}
         return found_of(self._get("/v1/find", what=what, limit=limit, **given, **place))
 
@@ -190,10 +204,6 @@ class Reading:
         """
         return self._get(path, **parameters)
 
-    def pages(self, path: str, **parameters: Any) -> Iterator[Any]:
-        """The items of a list of the service as JSON has them, page by page. Raises SemdbError."""
-        return self._pages(path, **parameters)
-
     def _get(self, path: str, **parameters: Any) -> Any:
         given = {name: _text(value) for name, value in parameters.items() if value is not None}
         return self._transport.json("GET", path, params=given)
@@ -218,14 +228,16 @@ def _text(value: Any) -> str:
     return repr(float(value)) if isinstance(value, float) else storable(str(value))
 
 
-def _key(keyframe_id: int) -> int:
+def key_of(keyframe_id: int) -> int:
+    """The id of a keyframe. Raises NotFoundError for what can be none."""
     key = int(keyframe_id)
     if not 0 < key < 2**63:
         raise NotFoundError(f"there is no keyframe {key}")
     return key
 
 
-def _three(origin: Sequence[float]) -> tuple[float, float, float]:
+def three(origin: Sequence[float]) -> tuple[float, float, float]:
+    """A place. Raises UsageError for what is none."""
     if len(origin) != 3:
         raise UsageError(f"a place is three numbers in metres, X,Y,Z, not {origin}")
     x, y, z = (float(value) for value in origin)

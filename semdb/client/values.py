@@ -198,9 +198,9 @@ def _hit(hit: Document) -> FoundLandmark:
         map=hit["map"],
         category=hit["category"],
         probability=hit["probability"],
-        position=_three(hit["position"]),
+        position=three_of(hit["position"]),
         covariance=np.array(hit["covariance"], np.float64),
-        size=_three(hit["box"]["size"]),
+        size=three_of(hit["box"]["size"]),
         yaw=hit["box"]["yaw"],
         state=hit["state"],
         sightings=hit["sightings"],
@@ -220,7 +220,7 @@ def _hit(hit: Document) -> FoundLandmark:
             view["recording"],
             view["frame_index"],
             _pose(view),
-            _box(view["crop"]),
+            box_of(view["crop"]),
             view["distance"],
         ),
     )
@@ -230,12 +230,14 @@ def _pose(view: Document) -> FloatArray:
     return np.array(view["world_from_camera"], np.float64)
 
 
-def _three(values: Sequence[float]) -> tuple[float, float, float]:
+def three_of(values: Sequence[float]) -> tuple[float, float, float]:
+    """Three numbers."""
     x, y, z = values
     return x, y, z
 
 
-def _box(values: Sequence[float]) -> tuple[float, float, float, float]:
+def box_of(values: Sequence[float]) -> tuple[float, float, float, float]:
+    """Four numbers."""
     x1, y1, x2, y2 = values
     return x1, y1, x2, y2
 
@@ -274,7 +276,7 @@ def _visited(found: Document) -> Visited:
     crop = found["crop"]
     return Visited(
         **{name: found[name] for name in names},
-        position=None if found["position"] is None else _three(found["position"]),
-        size=None if found["size"] is None else _three(found["size"]),
-        crop=None if crop is None else Crop(crop["keyframe"], crop["frame_index"], _box(crop["box"])),
+        position=None if found["position"] is None else three_of(found["position"]),
+        size=None if found["size"] is None else three_of(found["size"]),
+        crop=None if crop is None else Crop(crop["keyframe"], crop["frame_index"], box_of(crop["box"])),
     )

@@ -8,14 +8,22 @@ from typing import TYPE_CHECKING, Any, Protocol, Self, TypeAlias, overload
 if TYPE_CHECKING:
     from datetime import datetime
 
+    from semdb.database.jobs import Job
+    from semdb.database.landmark_reading import StoredLandmark, StoredRelation
+    from semdb.database.landmark_records import LandmarkVisit
     from semdb.database.pose_records import PoseOperation
-    from semdb.database.records import Deleted, MapInfo, RecordingStatus
+    from semdb.database.query_log import LoggedQuery, QueryFilter
+    from semdb.database.records import Deleted, FailedItem, MapInfo, RecordingStatus, StoredImage
+    from semdb.database.scene_reading import StoredSighting
+    from semdb.door.changed import Changes
     from semdb.door.found import Found
     from semdb.door.links import KeyframeLink
     from semdb.door.tracked import Tracked
     from semdb.door.values import Answer, Keyframe, Rows
     from semdb.ingestion.run import IngestSummary
+    from semdb.localization.coverage import Coverage
     from semdb.localization.query_image import Depth, Image, PathText
+    from semdb.pictures.cloud import Cloud
     from semdb.recordings.arrays import CameraLike
     from semdb.recordings.base import Recording
     from semdb.recordings.options import ReadOptions
@@ -81,7 +89,72 @@ class SemanticDatabase(Protocol):
         limit: int | None = None,
     ) -> list[Keyframe]: ...
 
-    def loops(self, map: str | None = None, *, odometry: bool = False) -> list[KeyframeLink]: ...
+    def check(self) -> None: ...
+
+    def check_keyframes(self, ids: Iterable[int]) -> None: ...
+
+    def has_recording(self, name: str, map: str | None = None) -> bool: ...
+
+    def keyframe_files(self, keyframe_id: int) -> StoredImage: ...
+
+    def loops(
+        self,
+        map: str | None = None,
+        *,
+        odometry: bool = False,
+        after: tuple[int, int, str] | None = None,
+        limit: int | None = None,
+    ) -> list[KeyframeLink]: ...
+
+    def landmarks(
+        self,
+        map: str,
+        *,
+        category: str | None = None,
+        state: str | None = None,
+        after: int = 0,
+        limit: int | None = None,
+    ) -> list[StoredLandmark]: ...
+
+    def relations(
+        self,
+        map: str,
+        *,
+        kind: str | None = None,
+        landmark: int | None = None,
+        after: tuple[int, int, str] | None = None,
+        limit: int | None = None,
+    ) -> list[StoredRelation]: ...
+
+    def up(self, map: str) -> tuple[float, float, float] | None: ...
+
+    def coverage(self, map: str, position: Sequence[float] | None = None, *, radius_m: float = 2.0) -> Coverage: ...
+
+    def sightings(self, map: str, landmark: int) -> list[StoredSighting]: ...
+
+    def visits(self, map: str, landmark: int) -> list[LandmarkVisit]: ...
+
+    def seen_in(self, keyframe_id: int) -> list[StoredSighting]: ...
+
+    def scene(self, map: str) -> dict[str, Any]: ...
+
+    def cloud(self, map: str, points: int = 100_000) -> Cloud: ...
+
+    def changes(self, before: str, after: str, map: str | None = None) -> Changes: ...
+
+    def queries(
+        self, map: str, *, before: int | None = None, limit: int = 100, wanted: QueryFilter | None = None
+    ) -> list[LoggedQuery]: ...
+
+    def query(self, query_id: int) -> tuple[str, LoggedQuery]: ...
+
+    def failures(self, recording: str, map: str) -> list[FailedItem]: ...
+
+    def job(self, job_id: int) -> Job: ...
+
+    def jobs(self, map: str | None = None, *, before: int | None = None, limit: int = 100) -> list[Job]: ...
+
+    def tables(self) -> dict[str, tuple[str, ...]]: ...
 
     def find(
         self,

@@ -8,11 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from semdb.errors import CodecError
 from semdb.geometry import back_project, transform_points
 from semdb.types import Camera, Float32Array, FloatArray, ImageArray
 
 FARTHEST_M = 8.0  # what sensors of rooms say beyond is mostly noise
 STEPS = 65_535
+HEAD = 32  # bytes before the points of what viewers get
 FEWEST_STEP_M = 0.005
 
 Colours = npt.NDArray[np.uint8]
@@ -35,6 +37,17 @@ class Cloud:
         grid = np.clip(np.round((self.points - low) / step), 0, STEPS).astype("<u2")
         head = np.array([count, self.keyframes], "<u4").tobytes() + np.concatenate([low, step]).astype("<f4").tobytes()
         return bytes(head + grid.tobytes() + self.colours.tobytes())
+
+    @classmethod
+    def unpacked(cls, data: bytes) -> Cloud:
+        """The points of `packed`, each on the step that it was put on. Raises CodecError for what is none of it."""
+        if len(data) < HEAD or len(data) != HEAD + 9 * int(np.frombuffer(data, "<u4", 1)[0]):
+            raise CodecError("these are no points as a service sends them")
+        count, keyframes = (int(value) for value in np.frombuffer(data, "<u4", 2))
+        low, step = np.frombuffer(data, "<f4", 6, 8).reshape(2, 3)
+        grid = np.frombuffer(data, "<u2", 3 * count, HEAD).reshape(count, 3)
+        colours = np.frombuffer(data, np.uint8, 3 * count, HEAD + 6 * count).reshape(count, 3)
+        return cls((low + grid * step).astype(np.float32), colours, keyframes)
 
 
 def points_of_depth(

@@ -132,12 +132,13 @@ async def list_relations(
     request: Request,
     map: MapName,
     kind: Annotated[str | None, Query(max_length=32, description="only of this kind: on, near, ...")] = None,
+    landmark: Annotated[int | None, Query(ge=1, le=2**63 - 1, description="only of this landmark to others")] = None,
     after: Annotated[str | None, Query(max_length=100, description="key of an earlier page")] = None,
     limit: Limit = None,
 ) -> Response:
     """How the landmarks of a map stand to each other, by ids."""
     most, last = limit or service_of(request).settings.page, _pair_key(after)
-    found = await read(request, lambda db: db.relations(map, kind=kind, after=last, limit=most + 1))
+    found = await read(request, lambda db: db.relations(map, kind=kind, landmark=landmark, after=last, limit=most + 1))
     return page_of(
         *(request, found, most),
         lambda one: f"{one.landmark_id}-{one.other_landmark_id}-{one.kind}",

@@ -34,6 +34,7 @@ class Visit(Model):
     recording: str
     presence: str
     keyframes: int
+    points: int
     seen: int
     seen_through: int
     position: Vector3 | None

@@ -226,7 +226,8 @@ def sighting_dict(found: StoredSighting) -> dict[str, Any]:
 
 def visit_dict(found: LandmarkVisit) -> dict[str, Any]:
     """What a recording says of a landmark."""
-    names = ("recording", "presence", "keyframes", "seen", "seen_through", "occluded", "missed", "position", "size")
+    counts = ("keyframes", "points", "seen", "seen_through", "occluded", "missed")
+    names = ("recording", "presence", *counts, "position", "size")
     return {name: getattr(found, name) for name in names}
 
 
@@ -251,6 +252,7 @@ def query_dict(found: LoggedQuery, *, with_path: bool) -> dict[str, Any]:
         "image": found.image if with_path else found.image.rpartition("/")[2],
         "verdict": found.verdict,
         "pose": None if pose is None else pose_dict(pose),
+        "world_from_camera": None if pose is None else pose.tolist(),
         "confidence": found.confidence,
         "inliers": found.inliers,
         "stage": found.stage,

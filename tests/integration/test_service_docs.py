@@ -71,7 +71,7 @@ def test_every_program_of_the_page_works(served: Served, monkeypatch: pytest.Mon
     names["db"].close()
     assert len(programs) > 8
     assert (names["found"].verdict, len(names["several"])) == (names["anywhere"].verdict, 2)
-    assert [job["state"] for job in names["jobs"]] == ["done"]
+    assert [job.state for job in names["jobs"]] == ["done"]
     assert served.database.keyframe(1).id == 1  # it was not confirmed
 
 

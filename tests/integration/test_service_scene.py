@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import asyncio
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
+import semdb
+from semdb.database.query_log import QueryFilter
+from semdb.errors import NotFoundError, UsageError
+from semdb.pictures.cloud import STEPS
 from semdb.service.settings import ServeSettings
 from tests.integration.opened import STRIDE, opener
 from tests.serving import Served, running
@@ -95,3 +104,97 @@ def test_images_come_smaller_and_in_part(served: Served) -> None:
     assert size(box="-50,-50,9999,9999", width=80)[0] == 80
     for bad in ({"box": "1,2,3"}, {"box": "nan,1,2,3"}, {"box": "9000,1,9010,3"}, {"width": 1}, {"box": "x"}):
         assert served.client.get(f"/v1/keyframes/{keyframe.id}/image", params=bad).status_code == 422, bad
+
+
+def plain(value: Any) -> Any:
+    """A value of the library as something that can be compared, arrays with their bits."""
+    if isinstance(value, np.ndarray):
+        return value.dtype.str, value.shape, value.tobytes()
+    if isinstance(value, dict):
+        return {key: plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return type(value), [plain(one) for one in value]
+    if isinstance(value, float):
+        return repr(value)  # NaN is like NaN
+    if hasattr(value, "__dataclass_fields__"):
+        return type(value), {name: plain(getattr(value, name)) for name in value.__dataclass_fields__}
+    return value
+
+
+def test_clients_get_the_values_of_the_library(served: Served) -> None:
+    own = served.database
+    keyframe = own.keyframes("office")[1]
+    own.localize(keyframe.image, map="office", camera=keyframe.camera, name="folder/one")
+    thing = max(own.landmarks("office"), key=lambda one: one.sightings)
+    related = own.relations("office")[0]
+    job = own.add_job("office", "loopback", {"path": "/somewhere/kitchen"})
+    last = own.queries("office")[0]
+    wanted = QueryFilter(verdict="localized", until=datetime(2100, 1, 1))
+    asked: list[Callable[[Any], Any]] = [
+        lambda db: db.landmarks("office"),
+        lambda db: db.landmarks("office", category=thing.category, state=thing.state, after=1, limit=2),
+        lambda db: db.relations("office"),
+        lambda db: db.relations("office", landmark=related.landmark_id, kind=related.kind, limit=1),
+        lambda db: db.relations(
+            "office", after=(related.landmark_id, related.other_landmark_id, related.kind), limit=2
+        ),
+        lambda db: (db.up("office"), db.up("empty")),
+        lambda db: (db.coverage("office"), db.coverage("empty"), db.coverage("office", (0, 0, 1), radius_m=1.5)),
+        lambda db: (db.sightings("office", thing.id), db.visits("office", thing.id), db.seen_in(keyframe.id)),
+        lambda db: (db.keyframe_files(keyframe.id), db.loops(odometry=True), db.loops("office", limit=3)),
+        lambda db: (db.has_recording("room"), db.has_recording("room", "empty"), db.has_recording("attic")),
+        lambda db: (db.queries("office", before=last.id + 1, limit=1), db.query(last.id)),
+        lambda db: (db.queries("office", wanted=wanted), db.queries("office", wanted=QueryFilter(text="dark"))),
+        lambda db: db.queries("office"),
+        lambda db: (db.failures("room", "office"), db.check_keyframes([keyframe.id]), db.scene("office")),
+    ]
+    with semdb.connect(served.url) as db:
+        for ask in asked:
+            assert plain(ask(db)) == plain(ask(own))
+        assert len(db.landmarks("office")) > 3
+        assert len(db.queries("office", wanted=wanted)) == 1
+        while own.job(job).state != "failed":  # there is no such folder
+            time.sleep(0.05)
+        found = db.job(job)
+        assert plain(replace(own.job(job), request={"name": "kitchen"}, who="")) == plain(found)
+        assert [one.id for one in db.jobs("office", limit=1)] == [job]
+        cloud, exact = db.cloud("office", 2000), own.cloud("office", 2000)
+        assert np.array_equal(cloud.colours, exact.colours)
+        span = np.ptp(exact.points, axis=0)
+        assert np.all(np.abs(cloud.points - exact.points) <= span / STEPS)  # half a step, and rounding
+        missing: list[Callable[[Any], Any]] = [
+            lambda db: db.landmarks("attic"),
+            lambda db: db.up("attic"),
+            lambda db: db.queries("attic"),
+            lambda db: db.has_recording("room", "attic"),
+            lambda db: db.failures("attic", "office"),
+            lambda db: db.check_keyframes([keyframe.id, 10**9]),
+            lambda db: db.keyframe_files(10**9),
+            lambda db: db.query(0),
+            lambda db: db.job(10**9),
+        ]
+        for ask in missing:
+            with pytest.raises(NotFoundError):
+                ask(own)
+            with pytest.raises(NotFoundError):
+                ask(db)
+        for ask in (lambda db: db.coverage("office", (0, 0)), lambda db: db.queries("office", limit=0)):
+            with pytest.raises(UsageError):
+                ask(db)
+
+        async def all_of_it() -> None:
+            async with db.aio as later:
+                assert plain(await later.landmarks("office", limit=2)) == plain(own.landmarks("office", limit=2))
+                assert plain(await later.coverage("office", (0, 0, 1))) == plain(own.coverage("office", (0, 0, 1)))
+                assert plain(await later.query(last.id)) == plain(own.query(last.id))
+
+        asyncio.run(all_of_it())
+
+
+def test_asyncio_has_every_method() -> None:
+    def methods(kind: type) -> set[str]:
+        return {name for name in dir(kind) if not name.startswith("_")}
+
+    only_here = {"refine", "trajectory", "align", "undo_align", "aio"}
+    assert methods(semdb.RemoteDatabase) - methods(semdb.AsyncDatabase) == only_here
+    assert {name for name in vars(semdb.SemanticDatabase) if not name.startswith("_")} <= methods(semdb.RemoteDatabase)
