@@ -48,6 +48,12 @@ class Viewing(Surveying):
         """What a map holds, in a line: equal lines, the same keyframes at the same poses. Raises NotFoundError."""
         return self._store().map_state(self._head(map).id)
 
+    def scene_state(self, map: str) -> str:
+        """What `scene` shows, in a line that is cheap to have: equal lines, the same scene. Raises NotFoundError."""
+        from semdb.database.scene_reading import scene_state
+
+        return scene_state(self._store().engine, self._head(map).id)
+
     def cloud(self, map: str, points: int = 100_000) -> Cloud:
         """Up to so many coloured points of a map, of up to 60 keyframes that lie apart.
 

@@ -36,7 +36,7 @@ from semdb.geometry import FARTHEST_POSE_M
 CLASSES, POINTS = "classes", "points"  # kinds: steps of `semdb refine`
 CHUNK = 500
 WRITE_CHUNK = 2000
-_MICRO = 1_000_000
+MICRO = 1_000_000
 Progress = Callable[[int, int], None]
 
 
@@ -46,15 +46,16 @@ def map_state(engine: Engine, map_id: int) -> str:
     Number of keyframes, newest id, sum of ids, sum of the poses in millionths. Ids are never used again, so another
     set of keyframes has another line; the change log is not asked, since it may be trimmed.
     """
-    return retry.read(engine, lambda connection: _map_state(connection, map_id))
+    return retry.read(engine, lambda connection: map_state_of(connection, map_id))
 
 
-def _map_state(connection: Connection, map_id: int) -> str:
+def map_state_of(connection: Connection, map_id: int) -> str:
+    """As `map_state`, within a transaction."""
     k = keyframes.c
     # weights, so that a turn or a move along any axis shows; integers, so that no order of adding does
-    mixed = _within(k.qw, 1) + 2 * _within(k.qx, 1) + 3 * _within(k.qy, 1) + 5 * _within(k.qz, 1)
-    mixed = mixed + 7 * _within(k.tx) + 11 * _within(k.ty) + 13 * _within(k.tz)
-    pose = cast(func.round(mixed * _MICRO), BigInteger)
+    mixed = within(k.qw, 1) + 2 * within(k.qx, 1) + 3 * within(k.qy, 1) + 5 * within(k.qz, 1)
+    mixed = mixed + 7 * within(k.tx) + 11 * within(k.ty) + 13 * within(k.tz)
+    pose = cast(func.round(mixed * MICRO), BigInteger)
     ids, poses = exact_sum(connection.engine, k.id), exact_sum(connection.engine, pose)
     query = select(func.count(), func.coalesce(func.max(k.id), 0), *ids, *poses)
     query = query.select_from(keyframes.join(recordings)).where(recordings.c.map_id == map_id)
@@ -62,7 +63,7 @@ def _map_state(connection: Connection, map_id: int) -> str:
     return f"{int(number)} {int(newest)} {whole(sums[: len(ids)])} {whole(sums[len(ids) :])}"
 
 
-def _within(column: ColumnElement[float], most: float = FARTHEST_POSE_M) -> ColumnElement[float]:
+def within(column: ColumnElement[float], most: float = FARTHEST_POSE_M) -> ColumnElement[float]:
     """A number of a pose; 0 for one that no pose has, which could overflow, and which is left out elsewhere."""
     return case((column.between(-2 * most, 2 * most), column), else_=0.0)
 
@@ -82,7 +83,7 @@ def list_refinements(
         if map_id is not None:
             query = query.where(refinements.c.map_id == map_id)
         rows = list(connection.execute(query))
-        states = {key: _map_state(connection, key) for key in sorted({row.map_id for row in rows})}
+        states = {key: map_state_of(connection, key) for key in sorted({row.map_id for row in rows})}
         found = []
         for row in rows:
             try:
@@ -139,7 +140,7 @@ def replace_refinement(
         if connection.execute(update(refinements).where(key).values(values)).rowcount == 0:
             connection.execute(insert(refinements).values(map_id=map_id, kind=kind, **values))
         rows = write(connection)
-        after = {} if state is not None else {"map_state": _map_state(connection, map_id)}
+        after = {} if state is not None else {"map_state": map_state_of(connection, map_id)}
         connection.execute(update(refinements).where(key).values(row_count=rows, **after))
         return rows
 
@@ -267,5 +268,5 @@ def _confusion(map_id: int, category: Any, other: Any, pairs: Any, weight: Any) 
         checked.text(category, f"categories.name {where}"),
         checked.text(other, f"categories.name {where}"),
         checked.integer(pairs, f"class_confusions.pairs {where}", 0, 2**63 - 1),
-        checked.integer(weight, f"class_confusions.weight {where}", 0, _MICRO),
+        checked.integer(weight, f"class_confusions.weight {where}", 0, MICRO),
     )

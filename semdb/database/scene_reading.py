@@ -5,10 +5,24 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Engine, select
+from sqlalchemy import BigInteger, Connection, Engine, cast, func, select
 
 from semdb.database import checked, retry
-from semdb.database.tables import categories, keyframes, landmark_sightings, landmarks, objects, recordings
+from semdb.database.exact_sums import exact_sum
+from semdb.database.refinements import MICRO, map_state_of, within
+from semdb.database.tables import (
+    categories,
+    keyframes,
+    landmark_sightings,
+    landmarks,
+    loop_closures,
+    map_gravity,
+    objects,
+    recordings,
+    refinements,
+)
+
+_UP = ("up_x", "up_y", "up_z")
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,3 +98,35 @@ def _sighting(row: Any) -> StoredSighting:
         coverage=real("coverage"),
         visibility=real("visibility"),
     )
+
+
+def scene_state(engine: Engine, map_id: int) -> str:
+    """What viewers draw of a map, in a line: equal lines, the same keyframes, landmarks, links and up.
+
+    Sums, as of `refinements.map_state`, which cost a fraction of reading the rows.
+    """
+    return retry.read(engine, lambda connection: _scene_state(connection, map_id))
+
+
+def _scene_state(connection: Connection, map_id: int) -> str:
+    r, t, c = refinements.c, landmarks.c, loop_closures.c
+    steps = select(r.kind, r.computed_at, r.row_count, r.map_state).where(r.map_id == map_id).order_by(r.kind)
+    up = select(*(getattr(map_gravity.c, name) for name in _UP)).where(map_gravity.c.map_id == map_id)
+    mixed = within(t.x) + 2 * within(t.y) + 3 * within(t.z) + 5 * within(t.size_x) + 7 * within(t.size_y)
+    mixed = mixed + 11 * within(t.size_z) + 13 * within(t.yaw) + 17 * within(t.probability)
+    places = exact_sum(connection.engine, cast(func.round(mixed * MICRO), BigInteger))
+    ids = exact_sum(connection.engine, t.id)
+    things = select(t.category_id, t.state, func.count(), func.coalesce(func.max(t.last_seen_ns), 0), *ids, *places)
+    things = things.where(t.map_id == map_id).group_by(t.category_id, t.state).order_by(t.category_id, t.state)
+    ends = exact_sum(connection.engine, c.keyframe_id + 3 * c.other_keyframe_id)
+    links = select(c.kind, c.state, func.count(), func.coalesce(func.sum(c.inliers), 0), *ends)
+    links = links.select_from(loop_closures.join(keyframes, keyframes.c.id == c.keyframe_id).join(recordings))
+    links = links.where(recordings.c.map_id == map_id).group_by(c.kind, c.state).order_by(c.kind, c.state)
+    parts = [map_state_of(connection, map_id)]
+    for query in (steps, up, things, links):
+        parts += [_in_a_line(row) for row in connection.execute(query)]
+    return "; ".join(parts)
+
+
+def _in_a_line(row: Any) -> str:
+    return " ".join(value if isinstance(value, str) else str(value) for value in row)

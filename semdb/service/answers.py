@@ -31,19 +31,35 @@ def as_json(content: Any, status: int = 200, headers: dict[str, str] | None = No
     return Response(encoded(content), status, headers, "application/json")
 
 
+def tag_of(content: bytes) -> str:
+    """The ETag of what is told by `content`: the bytes of an answer, or all that makes them."""
+    return f'"{hashlib.sha256(content).hexdigest()[:32]}"'
+
+
+def has(request: Request, tag: str) -> bool:
+    """Whether the client says that it has what has this ETag."""
+    known = [one.strip().removeprefix("W/") for one in request.headers.get("if-none-match", "").split(",")]
+    return tag in known or "*" in known
+
+
 def tagged(
-    request: Request, content: bytes, media_type: str, *, for_ever: bool, headers: dict[str, str] | None = None
+    request: Request,
+    content: bytes,
+    media_type: str,
+    *,
+    for_ever: bool,
+    headers: dict[str, str] | None = None,
+    tag: str | None = None,
 ) -> Response:
     """`content` with its ETag, or 304 where the client has it. `for_ever`: it never changes under its address."""
-    tag = f'"{hashlib.sha256(content).hexdigest()[:32]}"'
+    tag = tag or tag_of(content)
     all_headers = {
         "ETag": tag,
         "Cache-Control": FOR_EVER if for_ever else ASK_AGAIN,
         "Vary": "Authorization",  # what a browser kept for one token is not for whoever comes with another
         **(headers or {}),
     }
-    known = [one.strip().removeprefix("W/") for one in request.headers.get("if-none-match", "").split(",")]
-    if tag in known or "*" in known:
+    if has(request, tag):
         return Response(None, 304, all_headers)
     return Response(content, 200, all_headers, media_type)
 

@@ -4,32 +4,39 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from collections.abc import Callable
 from typing import Annotated
 
 from fastapi import Query, Request
 from starlette.responses import Response
 
+import semdb
 from semdb.api import Database
 from semdb.service import scene_schemas as schemas
 from semdb.service import values
-from semdb.service.answers import as_json, encoded, tagged
+from semdb.service.answers import as_json, encoded, has, tag_of, tagged
 from semdb.service.keyframe_routes import keyframe_of
 from semdb.service.roles import READ
 from semdb.service.routing import KeyframeId, MapName, Table
-from semdb.service.state import draw, read
+from semdb.service.state import draw, read, service_of
 
 table = Table("views")
-MOST_CLOUDS = 4  # that are kept in memory
+MOST_KEPT = 4  # scenes, and clouds, in memory
 _FILE = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
 _clouds: OrderedDict[tuple[str, str, str, int], bytes] = OrderedDict()
+_scenes: OrderedDict[tuple[str, str, str, int], bytes] = OrderedDict()
 _turn = threading.Lock()
 
 
 @table.route("GET", "/v1/maps/{map}/scene", READ, schemas.Scene, errors=(304,))
 async def get_scene(request: Request, map: MapName) -> Response:
     """All keyframes, landmarks and accepted links of a map, column by column: what a viewer draws."""
-    found = await draw(request, lambda db: encoded(db.scene(map)))
-    return tagged(request, found, "application/json", for_ever=False)
+    state = await draw(request, lambda db: db.scene_state(map))
+    tag = tag_of(f"{semdb.__version__} {service_of(request).database.url} {map} {state}".encode())
+    if has(request, tag):
+        return tagged(request, b"", "application/json", for_ever=False, tag=tag)
+    found = await draw(request, lambda db: _kept(_scenes, (db.url, map, state, 0), lambda: encoded(db.scene(map))))
+    return tagged(request, found, "application/json", for_ever=False, tag=tag)
 
 
 @table.route("GET", "/v1/maps/{map}/points", READ, errors=(304,), only=_FILE)
@@ -49,16 +56,23 @@ async def get_points(
 
 def _points(db: Database, map_name: str, count: int) -> bytes:
     key = (db.url, map_name, db.map_state(map_name), count)
+    return _kept(_clouds, key, lambda: db.cloud(map_name, count).packed())
+
+
+def _kept(
+    where: OrderedDict[tuple[str, str, str, int], bytes], key: tuple[str, str, str, int], make: Callable[[], bytes]
+) -> bytes:
+    """What was made for that key, or is made now; only the last few are kept."""
     with _turn:
-        if key in _clouds:
-            _clouds.move_to_end(key)
-            return _clouds[key]
-    packed = db.cloud(map_name, count).packed()
+        if key in where:
+            where.move_to_end(key)
+            return where[key]
+    made = make()
     with _turn:
-        _clouds[key] = packed
-        while len(_clouds) > MOST_CLOUDS:
-            _clouds.popitem(last=False)
-    return packed
+        where[key] = made
+        while len(where) > MOST_KEPT:
+            where.popitem(last=False)
+    return made
 
 
 @table.route("GET", "/v1/maps/{map}/landmarks/{landmark}/sightings", READ, schemas.LandmarkHistory)

@@ -13,12 +13,17 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from sqlalchemy import delete, update
 
 import semdb
+from semdb.database import tables
 from semdb.database.query_log import QueryFilter
+from semdb.database.scene_reading import scene_state
+from semdb.database.store import Store
 from semdb.errors import NotFoundError, UsageError
 from semdb.pictures.cloud import STEPS
 from semdb.service.settings import ServeSettings
+from tests.database_samples import fill, stored_landmarks
 from tests.integration.opened import STRIDE, opener
 from tests.serving import Served, running
 
@@ -198,3 +203,37 @@ def test_asyncio_has_every_method() -> None:
     only_here = {"refine", "trajectory", "align", "undo_align", "aio"}
     assert methods(semdb.RemoteDatabase) - methods(semdb.AsyncDatabase) == only_here
     assert {name for name in vars(semdb.SemanticDatabase) if not name.startswith("_")} <= methods(semdb.RemoteDatabase)
+
+
+def test_a_scene_that_did_not_change_is_not_made_again(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    answer = served.client.get("/v1/maps/office/scene")
+    monkeypatch.setattr(type(served.database), "scene", lambda *_: pytest.fail("the scene is made"))
+    again = served.client.get("/v1/maps/office/scene", headers={"If-None-Match": answer.headers["ETag"]})
+    assert (again.status_code, again.content, again.headers["ETag"]) == (304, b"", answer.headers["ETag"])
+    kept = served.client.get("/v1/maps/office/scene", headers={"If-None-Match": '"another"'})
+    assert (kept.status_code, kept.content) == (200, answer.content)
+    monkeypatch.undo()
+    served.database.tell_up("office", (0.0, 0.6, 0.8))
+    other = served.client.get("/v1/maps/office/scene", headers={"If-None-Match": answer.headers["ETag"]})
+    assert (other.status_code, other.json()["up"]) == (200, [0.0, 0.6, 0.8])
+
+
+def test_the_state_of_a_scene_follows_all_that_it_shows(store: Store) -> None:
+    map_id, _, keyframes = fill(store)
+    stored_landmarks(store, map_id)
+    states = [scene_state(store.engine, map_id)]
+    assert scene_state(store.engine, map_id) == states[0]
+    changes = [
+        update(tables.landmarks).where(tables.landmarks.c.id == 1).values(yaw=0.2),
+        update(tables.landmarks).where(tables.landmarks.c.id == 1).values(state="gone"),
+        update(tables.map_gravity).values(up_x=0.6, up_z=0.8),
+        update(tables.keyframes).where(tables.keyframes.c.id == keyframes[0]).values(tx=0.5),
+        delete(tables.landmarks).where(tables.landmarks.c.id == 2),
+    ]
+    for statement in changes:
+        with store.engine.begin() as connection:
+            connection.execute(statement)
+        states.append(scene_state(store.engine, map_id))
+    fill(store, "another")
+    assert scene_state(store.engine, map_id) == states[-1]
+    assert len(set(states)) == len(states)
