@@ -19,6 +19,7 @@ export const PAGES: readonly [string, string, string][] = [
 export function shell(): HTMLElement {
   const main = h("main", { id: "main", attrs: { tabindex: -1 } });
   const links = PAGES.map(([address, text]) => a(address, null, text));
+  document.getElementById("before")?.remove(); // what was there before there was a page
   document.body.append(
     h("a", { class: "skip", attrs: { href: "#main" }, on: { click: () => main.focus() } }, texts.skip),
     h(

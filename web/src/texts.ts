@@ -49,6 +49,8 @@ export const texts = {
       ["g then s", "SQL"],
       ["v", "a map in 3D or from above"],
       ["h", "show all of a map"],
+      ["arrows, Shift", "in space: move, with Shift turn"],
+      ["+, -", "in space: nearer, farther"],
       ["g then i", "ingest"],
       ["g then p", "locate photos"],
       ["j, k", "next and previous photo"],
@@ -374,5 +376,6 @@ export const texts = {
     ago: (seconds: number) => (seconds < 2 ? "now" : `${Math.round(seconds)} s ago`),
     lost: "The service does not answer; this is what was last known.",
     frames: (n: number) => texts.count(n, "frame", "frames"),
+    flyTo: (camera: string) => `Fly there: ${camera}`,
   },
 };

@@ -19,7 +19,7 @@ export class Labels {
   private readonly sizes = new Map<string, [number, number]>();
 
   /** Places the heaviest labels that do not cover each other. `project`: pixels, or null behind the camera. */
-  draw(labels: readonly Label[], project: (at: Vector3) => { x: number; y: number; far: number } | null, width: number, height: number): void {
+  draw(labels: readonly Label[], project: (at: Vector3) => { x: number; y: number; far: number } | null, width: number, height: number, most = MOST): void {
     const seen = labels
       .map((label) => ({ label, spot: project(label.at) }))
       .filter((one) => one.spot !== null && one.spot.x > 0 && one.spot.x < width && one.spot.y > 0 && one.spot.y < height)
@@ -29,7 +29,7 @@ export class Labels {
     const taken: [number, number, number, number][] = [];
     const shown = new Set<string>();
     for (const { label, spot } of seen) {
-      if (shown.size >= MOST) break;
+      if (shown.size >= most) break;
       const [w, tall] = this.sizes.get(label.text) ?? [14 + 7.2 * label.text.length, 20];
       const box: [number, number, number, number] = [spot.x - w / 2, spot.y - tall, spot.x + w / 2, spot.y];
       if (taken.some((other) => box[0] < other[2] && box[2] > other[0] && box[1] < other[3] && box[3] > other[1])) continue;

@@ -1,99 +1,90 @@
 // The map in space. It draws when something changed, and not otherwise.
-import {
-  type BufferGeometry,
-  type Camera,
-  Color,
-  Group,
-  type LineBasicMaterial,
-  type LineSegments,
-  type Material,
-  type Object3D,
-  OrthographicCamera,
-  PerspectiveCamera,
-  Plane,
-  type Points,
-  type PointsMaterial,
-  Scene,
-  Vector3 as V3,
-  WebGLRenderer,
-} from "three";
-import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
-import { type KeyframeItem, type LandmarkItem, type MapScene, type PointCloud, css, distance, dot, hueColour, plus, scaled, unit } from "../model";
+import { type BufferGeometry, type Camera, Color, Group, type LineSegments, type Material, type Object3D, Plane, type Points, type PointsMaterial, Scene, Vector3 as V3, WebGLRenderer } from "three";
+import { type KeyframeItem, type LandmarkItem, type MapScene, type PointCloud, css, hueColour, plus, scaled } from "../model";
 import type { Vector3 } from "../types";
 import { colour, theme } from "../ui/theme";
+import { Extent, present } from "./extent";
 import { type Label, Labels } from "./labels";
-import { boxLines, cloudPoints, corners, dots, ellipsoids, floorGrid, frustumLines, lines, linkLines, trails } from "./layers";
-import { hitBox } from "./pick";
+import { VERTICES, boxLines, cloudPoints, dots, floorGrid, frustumLines, linkLines, ringLines, trails } from "./layers";
+import { type Mode, Navigation, type ViewState } from "./navigation";
+import { nearestFirst } from "./nearest";
+import { type Extra, Overlay } from "./overlay";
+import { Painter, type Part } from "./painter";
+import { type Picked, pick } from "./pick";
+import { corners } from "./shapes";
 
+export type { Extra, Mode, Picked, ViewState };
 export const LAYERS = ["points", "cameras", "landmarks", "names", "trails", "links", "uncertainty", "grid"] as const;
 export type Layer = (typeof LAYERS)[number];
-export type Mode = "3d" | "top";
-export type Picked = { kind: "keyframe"; id: number } | { kind: "landmark"; id: number } | null;
 
-const MOVING_POINTS = 25_000;
-const REST_MS = 220;
-/** So many frusta and boxes have edges, at rest and while the view moves; of all others there are dots. */
+/** So many of each kind have edges, at rest and while the view moves; of all others there are dots. */
 const EDGES = { rest: 1500, moving: 250 };
+const RINGS = { rest: 1500, moving: 60 };
+const DOTS_MOVING = 2500;
+const SEGMENT_COST = 4; // of a line, in points of the cloud
+const DOT_COST = 3;
 const MOST_LABELLED = 600;
+const LABELS_IN_HASTE = 14; // while the view moves, where the processor draws
 
 export interface ViewerOptions {
   picked: (what: Picked) => void;
-  /** The view was moved by hand: see `state`. */
+  /** The view was moved by hand, or flew: see `state`. */
   moved: () => void;
 }
 
-/** Where the view is: what it turns about, angles in radians, metres. */
-export interface ViewState {
-  target: Vector3;
-  position: Vector3;
-  zoom: number;
+/** A layer of items with edges; of many, those nearest to the eye. */
+interface Edged {
+  layer: Layer;
+  part: Part;
+  lines: LineSegments;
+  items: readonly { position: Vector3 }[];
+  most: number;
 }
 
 export class Viewer {
   readonly element: HTMLElement;
-  /** How long the last pictures took, milliseconds. */
-  readonly frames: number[] = [];
   private readonly renderer: WebGLRenderer;
   private readonly world = new Scene();
-  private readonly perspective = new PerspectiveCamera(55, 1, 0.02, 500);
-  private readonly above = new OrthographicCamera(-1, 1, 1, -1, -500, 500);
-  private controls: OrbitControls;
+  private readonly navigation: Navigation;
+  private readonly painter: Painter;
+  private readonly overlay: Overlay;
   private readonly labels = new Labels();
   private readonly layers = new Map<Layer, Object3D>();
-  private readonly extras = new Map<string, Object3D>();
-  private readonly hidden = new Set<Layer>();
+  private readonly hidden: Set<Layer>;
+  private extent: Extent;
   private points: Points | null = null;
-  private edges: { edges: LineSegments; vertices: number }[] = [];
+  private edged: Edged[] = [];
+  private dotted: Part[] = [];
   private labelled: Label[] = [];
   private cloud: PointCloud | null = null;
-  private selection: Object3D[] = [];
+  private chosen: { keyframes: readonly KeyframeItem[]; landmarks: readonly LandmarkItem[] } = { keyframes: [], landmarks: [] };
   private chosenLandmarks = new Set<number>();
-  private asked = 0;
-  private moving = 0;
-  private flight = 0;
-  private mode: Mode = "3d";
-  private radius = 2;
-  private centre: Vector3 = [0, 0, 0];
-  private ceiling = Infinity;
+  private overlayAsked = 0;
   private readonly resize: ResizeObserver;
 
   /** Raises where there is no WebGL. */
   constructor(
     readonly scene: MapScene,
     private readonly options: ViewerOptions,
+    hidden: Iterable<Layer> = [],
   ) {
+    this.hidden = new Set(hidden);
     const software = isSoftware();
-    this.renderer = new WebGLRenderer({ antialias: !software, powerPreference: "high-performance" });
-    this.renderer.setPixelRatio(software ? 1 : Math.min(devicePixelRatio, 2));
+    // what was drawn stays: the rest of a picture is drawn over its beginning
+    this.renderer = new WebGLRenderer({ antialias: !software, powerPreference: "high-performance", preserveDrawingBuffer: true });
+    const ratio = software ? 1 : Math.min(devicePixelRatio, 2);
+    this.renderer.setPixelRatio(ratio);
+    this.overlay = new Overlay(ratio);
     const canvas = this.renderer.domElement;
     canvas.tabIndex = 0;
     canvas.setAttribute("role", "application");
     this.element = document.createElement("div");
     this.element.className = "viewer";
-    this.element.append(canvas, this.labels.element);
-    this.measure();
-    for (const camera of [this.perspective, this.above]) camera.up.set(...scene.up);
-    this.controls = this.control(this.perspective);
+    this.element.append(canvas, this.overlay.element, this.labels.element);
+    this.extent = new Extent(scene, null);
+    this.navigation = new Navigation(scene, canvas, this.extent, { stirred: () => this.painter.stir(), moved: () => options.moved() });
+    const around = { before: (moving: boolean) => this.prepare(moving), after: (moving: boolean) => this.drawOver(moving && software) };
+    this.painter = new Painter(this.renderer, this.world, () => this.camera, around, software);
     this.build();
     this.listen(canvas);
     this.resize = new ResizeObserver(() => this.fit());
@@ -107,21 +98,31 @@ export class Viewer {
 
   dispose(): void {
     this.resize.disconnect();
-    cancelAnimationFrame(this.asked);
-    cancelAnimationFrame(this.flight);
-    clearTimeout(this.moving);
-    this.controls.dispose();
+    this.painter.dispose();
+    cancelAnimationFrame(this.overlayAsked);
+    this.navigation.dispose();
     this.world.traverse(release);
     this.renderer.dispose();
     this.renderer.forceContextLoss();
     this.element.remove();
   }
 
+  /** All of the picture is drawn; for tests and pictures. */
+  get complete(): boolean {
+    return this.painter.complete;
+  }
+
+  /** Times between the last frames, milliseconds. */
+  get frames(): readonly number[] {
+    return this.painter.frames;
+  }
+
   // what is drawn
 
   setPoints(cloud: PointCloud): void {
     this.cloud = cloud;
-    if (this.scene.keyframes.length === 0 && cloud.count > 0) this.measure();
+    this.extent = new Extent(this.scene, cloud);
+    this.navigation.extent = this.extent;
     this.build();
   }
 
@@ -130,96 +131,87 @@ export class Viewer {
     else this.hidden.add(layer);
     const found = this.layers.get(layer);
     if (found) found.visible = on;
-    this.invalidate();
+    else if (on && layer === "uncertainty") this.build(); // of many things they take a while, and are seldom wanted
+    this.painter.invalidate();
   }
 
   /** Draws all layers anew: after the theme changed, too. */
   build(): void {
     for (const object of this.layers.values()) this.drop(object);
     this.layers.clear();
-    const { scene } = this;
+    this.edged = [];
+    this.dotted = [];
+    const { scene, extent } = this;
     const dark = theme.get() === "dark";
-    this.world.background = new Color(colour("--scene"));
-    const size = this.frustumSize();
-    this.edges = [];
-    const cameras = scattered(scene.keyframes);
+    const under = new Color(colour("--scene"));
+    this.renderer.setClearColor(under, 1);
     const ofRecording = (item: KeyframeItem): [number, number, number] => hueColour(item.recordingIndex, dark);
-    this.putMany("cameras", frustumLines(cameras, size, cameras.map(ofRecording)), cameras, ofRecording, 16);
-    const things = scene.landmarks.filter(present).sort((a, b) => weight(b) - weight(a));
     const ofClass = (item: LandmarkItem): [number, number, number] => hueColour(item.categoryIndex, dark);
-    this.putMany("landmarks", boxLines(things, ofClass), things, ofClass, 24);
+    const things = scene.landmarks.filter(present).sort((a, b) => weight(b) - weight(a));
+    this.putMany("cameras", frustumLines(scene.keyframes, extent.frustumSize, ofRecording), scene.keyframes, ofRecording, VERTICES.frustum);
+    this.putMany("landmarks", boxLines(things, ofClass), things, ofClass, VERTICES.box);
+    if (!this.hidden.has("uncertainty")) this.putMany("uncertainty", ringLines(things, colour("--scene-sure")), things, null, VERTICES.rings);
     this.labelled = this.makeLabels(dark, things);
-    if (scene.keyframes.length > 1) this.put("trails", trails(scene, dark));
-    if (scene.links.length > 0) this.put("links", linkLines(scene, colour("--scene-loop")));
-    if (things.length > 0) this.put("uncertainty", ellipsoids(things.slice(0, EDGES.rest), colour("--scene-sure")));
-    this.put("grid", floorGrid(scene, this.centre, this.radius, this.floor(), colour("--line-strong")));
+    if (scene.keyframes.length > 1) this.put("trails", trails(scene, dark, under));
+    if (scene.links.length > 0) this.put("links", linkLines(scene, colour("--scene-loop"), under));
+    this.put("grid", floorGrid(scene, extent.centre, extent.radius, extent.floor, colour("--line-strong"), under));
     this.points = null;
+    const parts = [...this.edged.map(({ part }) => part), ...this.dotted];
     if (this.cloud && this.cloud.count > 0) {
-      this.points = cloudPoints(this.cloud, this.pointSize(this.cloud));
-      this.dress(this.points.material as PointsMaterial);
+      this.points = cloudPoints(this.cloud, extent.pointSize);
+      this.dress();
       this.put("points", this.points);
+      parts.push({ object: this.points, items: this.cloud.count, vertices: 1, cost: 1, moving: Infinity });
     }
-    this.invalidate();
-  }
-
-  /** About as large as points are apart. */
-  private pointSize(cloud: PointCloud): number {
-    return Math.min(0.06, Math.max(0.006, 2.5 * this.radius / Math.sqrt(cloud.count)));
+    this.painter.set(parts);
+    this.mark();
   }
 
   /** A layer of things with edges, and with dots where they are too many for that. */
-  private putMany<T extends { position: Vector3 }>(layer: Layer, edges: LineSegments, items: readonly T[], paint: (item: T) => [number, number, number], vertices: number): void {
+  private putMany<T extends { position: Vector3 }>(layer: Layer, lines: LineSegments, items: readonly T[], paint: ((item: T) => [number, number, number]) | null, vertices: number): void {
+    const limits = paint ? EDGES : RINGS;
     const group = new Group();
-    group.add(edges);
-    this.edges.push({ edges, vertices });
-    if (items.length > EDGES.moving) group.add(dots(items.map((item) => item.position), items.map(paint), 4 * this.renderer.getPixelRatio()));
+    group.add(lines);
+    const part = { object: lines, items: items.length, vertices, cost: (SEGMENT_COST * vertices) / 2, moving: limits.moving };
+    this.edged.push({ layer, part, lines, items, most: limits.rest });
+    if (paint && items.length > EDGES.moving) {
+      const spread = scattered(items);
+      const object = dots(spread.map((item) => item.position), spread.map(paint), 4 * this.renderer.getPixelRatio());
+      group.add(object);
+      this.dotted.push({ object, items: items.length, vertices: 1, cost: DOT_COST, moving: DOTS_MOVING });
+    }
     this.put(layer, group);
   }
 
-  /** A camera that is none of the map's, by a name: a photo, or one that moves. `item` null takes it away. */
-  extra(name: string, item: Pick<KeyframeItem, "position" | "axes" | "camera"> | null, paint = "--scene-select", size = 1.6): void {
-    const before = this.extras.get(name);
-    if (before) this.drop(before);
-    this.extras.delete(name);
-    if (item) {
-      const { r, g, b } = new Color(colour(paint)).convertLinearToSRGB();
-      const made = frustumLines([item], this.frustumSize() * size, [[r, g, b]]);
-      onTop(made);
-      this.world.add(made);
-      this.extras.set(name, made);
-    }
-    this.invalidate();
-  }
-
-  /** A path that is none of the map's: positions one after the other. */
-  extraPath(name: string, path: readonly Vector3[], paint = "--scene-select"): void {
-    const before = this.extras.get(name);
-    if (before) this.drop(before);
-    this.extras.delete(name);
-    if (path.length > 1) {
-      const positions = new Float32Array(path.slice(1).flatMap((to, i) => [...(path[i] ?? to), ...to]));
-      const made = lines(positions, null, colour(paint));
-      onTop(made);
-      this.world.add(made);
-      this.extras.set(name, made);
-    }
-    this.invalidate();
+  /** From above points are as large in pixels, and what is over the heads is left out. */
+  private dress(): void {
+    if (!this.points) return;
+    const material = this.points.material as PointsMaterial;
+    const top = this.mode === "top";
+    material.sizeAttenuation = !top;
+    material.size = top ? 2.2 * this.renderer.getPixelRatio() : this.extent.pointSize;
+    const cut = top && Number.isFinite(this.extent.ceiling);
+    material.clippingPlanes = cut ? [new Plane(new V3(...scaled(this.scene.up, -1)), this.extent.ceiling)] : [];
+    material.needsUpdate = true;
   }
 
   /** Marks keyframes and things; what they were before is forgotten. */
   highlight(keyframes: readonly KeyframeItem[], landmarks: readonly LandmarkItem[]): void {
-    for (const object of this.selection) this.drop(object);
-    this.selection = [];
+    this.chosen = { keyframes, landmarks };
+    this.mark();
+  }
+
+  private mark(): void {
+    const { keyframes, landmarks } = this.chosen;
     this.chosenLandmarks = new Set(landmarks.map((item) => item.id));
-    const { r, g, b } = new Color(colour("--scene-select")).convertLinearToSRGB();
-    const paint: [number, number, number] = [r, g, b];
-    if (keyframes.length > 0) this.selection.push(frustumLines(keyframes, 1.3 * this.frustumSize(), [paint]));
-    if (landmarks.length > 0) this.selection.push(boxLines(landmarks, () => paint));
-    for (const object of this.selection) {
-      onTop(object as LineSegments);
-      this.world.add(object);
-    }
-    this.invalidate();
+    this.overlay.choose(keyframes, landmarks, this.extent.frustumSize);
+    this.later();
+  }
+
+  /** Cameras that are none of the map's; those that were there before are gone. */
+  setExtras(extras: readonly Extra[]): void {
+    this.overlay.show(extras, this.extent.frustumSize);
+    this.later();
   }
 
   private put(layer: Layer, object: Object3D): void {
@@ -233,205 +225,78 @@ export class Viewer {
     object.traverse(release);
   }
 
-  // sizes
-
-  private measure(): void {
-    const places = [...this.scene.keyframes.map((item) => item.position), ...this.scene.landmarks.filter(present).map((item) => item.position)];
-    if (this.cloud) for (let i = 0; i < Math.min(this.cloud.count, 2000); i++) places.push(this.cloud.positions.slice(3 * i, 3 * i + 3) as unknown as Vector3);
-    if (places.length === 0) return;
-    const middle = (axis: 0 | 1 | 2): number => {
-      const sorted = places.map((place) => place[axis]).sort((a, b) => a - b);
-      return ((sorted[Math.floor(0.02 * sorted.length)] ?? 0) + (sorted[Math.ceil(0.98 * sorted.length) - 1] ?? 0)) / 2;
-    };
-    this.centre = [middle(0), middle(1), middle(2)];
-    const far = places.map((place) => distance(place, this.centre)).sort((a, b) => a - b);
-    this.radius = Math.max(0.8, 1.15 * (far[Math.floor(0.97 * (far.length - 1))] ?? 1));
-    const heights = this.scene.keyframes.map((item) => dot(item.position, this.scene.up)).sort((a, b) => a - b);
-    this.ceiling = (heights[Math.floor(heights.length / 2)] ?? Infinity) + 0.35;
-  }
-
-  private frustumSize(): number {
-    const crowd = Math.cbrt(Math.max(1, this.scene.keyframes.length / 60));
-    return Math.max(0.04, Math.min(0.16, 0.05 * this.radius) / Math.min(crowd, 3));
-  }
-
-  private floor(): number {
-    const { up } = this.scene;
-    const heights: number[] = [];
-    if (this.cloud) for (let i = 0; i < Math.min(this.cloud.count, 5000); i++) heights.push(dot([this.cloud.positions[3 * i] ?? 0, this.cloud.positions[3 * i + 1] ?? 0, this.cloud.positions[3 * i + 2] ?? 0], up));
-    for (const item of this.scene.landmarks) heights.push(dot(item.position, up) - item.size[2] / 2);
-    if (heights.length === 0) return dot(this.centre, up) - 1;
-    heights.sort((a, b) => a - b);
-    return heights[Math.floor(0.01 * heights.length)] ?? 0;
-  }
-
-  /** From above points are as large in pixels, and what is over the heads is left out. */
-  private dress(material: PointsMaterial): void {
-    const top = this.mode === "top";
-    material.sizeAttenuation = !top;
-    material.size = top ? 2.2 * this.renderer.getPixelRatio() : this.cloud ? this.pointSize(this.cloud) : 0.02;
-    material.clippingPlanes = this.clipping();
-    material.needsUpdate = true;
-  }
-
-  private clipping(): Plane[] {
-    if (this.mode !== "top" || !Number.isFinite(this.ceiling)) return [];
-    return [new Plane(new V3(...scaled(this.scene.up, -1)), this.ceiling)];
-  }
-
   // where it is looked at from
 
   get camera(): Camera {
-    return this.mode === "top" ? this.above : this.perspective;
+    return this.navigation.camera;
+  }
+
+  get mode(): Mode {
+    return this.navigation.mode;
+  }
+
+  get state(): ViewState {
+    return this.navigation.state;
+  }
+
+  set state(state: ViewState) {
+    this.navigation.state = state;
   }
 
   setMode(mode: Mode): void {
     if (mode === this.mode) return;
-    this.mode = mode;
-    this.controls.dispose();
-    this.controls = this.control(mode === "top" ? this.above : this.perspective);
     this.renderer.localClippingEnabled = mode === "top";
-    if (this.points) this.dress(this.points.material as PointsMaterial);
-    this.home(false);
-  }
-
-  private control(camera: PerspectiveCamera | OrthographicCamera): OrbitControls {
-    const controls = new OrbitControls(camera, this.renderer.domElement);
-    controls.zoomToCursor = true;
-    controls.screenSpacePanning = true;
-    controls.minDistance = 0.05;
-    controls.maxDistance = 20 * this.radius;
-    controls.enableRotate = this.mode === "3d";
-    if (this.mode === "top") {
-      controls.mouseButtons.LEFT = 2; // to move, since there is nothing to turn
-      controls.touches.ONE = 1;
-    }
-    controls.addEventListener("change", () => this.stir());
-    controls.addEventListener("end", () => this.options.moved());
-    return controls;
+    this.navigation.setMode(mode);
+    this.dress();
+    this.fit();
   }
 
   /** All of the map in sight. */
   home(animated = true): void {
-    const { up } = this.scene;
-    const back = unit(plus(this.sideways(), scaled(up, 0.75)));
-    if (this.mode === "top") {
-      this.above.zoom = 1;
-      this.flyTo(plus(this.centre, scaled(up, 50)), this.centre, animated);
-    } else this.flyTo(plus(this.centre, scaled(back, 1.8 * this.radius)), this.centre, animated);
+    this.navigation.home(animated);
     this.fit();
   }
 
-  /** A level direction from which the keyframes look away, so that one sees what they saw. */
-  private sideways(): Vector3 {
-    const { up, keyframes } = this.scene;
-    const sum = keyframes.reduce<Vector3>((total, item) => plus(total, item.axes[2]), [0, 0, 0]);
-    const level = plus(sum, scaled(up, -dot(sum, up)));
-    if (Math.hypot(...level) < 0.15 * Math.max(1, keyframes.length)) {
-      const side: Vector3 = Math.abs(up[0]) < 0.9 ? [1, 0.6, 0] : [0, 1, 0.6];
-      return unit(plus(side, scaled(up, -dot(side, up))));
-    }
-    return unit(scaled(level, -1));
-  }
-
-  get state(): ViewState {
-    const { target } = this.controls;
-    const { position } = this.controls.object;
-    return { target: [target.x, target.y, target.z], position: [position.x, position.y, position.z], zoom: this.above.zoom };
-  }
-
-  set state(state: ViewState) {
-    this.above.zoom = state.zoom;
-    this.above.updateProjectionMatrix();
-    this.flyTo(state.position, state.target, false);
-  }
-
   flyToLandmark(item: LandmarkItem): void {
-    const reach = Math.max(...item.size, 0.25);
-    if (this.mode === "top") return this.flyAbove(item.position);
-    const from = unit(plus(plus(this.state.position, scaled(item.position, -1)), scaled(this.scene.up, 0.2 * this.radius)));
-    this.flyTo(plus(item.position, scaled(from, Math.max(1.5, 3.4 * reach))), item.position);
+    this.navigation.toLandmark(item);
   }
 
-  /** Behind a keyframe, looking where it looks. */
+  /** Behind a camera, looking where it looks. */
   flyToKeyframe(item: Pick<KeyframeItem, "position" | "axes">): void {
-    if (this.mode === "top") return this.flyAbove(item.position);
-    const back = plus(plus(item.position, scaled(item.axes[2], -0.8)), scaled(this.scene.up, 0.3));
-    this.flyTo(back, plus(item.position, scaled(item.axes[2], 1.2)));
-  }
-
-  private flyAbove(place: Vector3): void {
-    this.flyTo(plus(place, scaled(this.scene.up, 50)), place);
-  }
-
-  private flyTo(position: Vector3, target: Vector3, animated = true): void {
-    cancelAnimationFrame(this.flight);
-    const { controls } = this;
-    const from = { position: controls.object.position.clone(), target: controls.target.clone() };
-    const to = { position: new V3(...position), target: new V3(...target) };
-    const still = !animated || matchMedia("(prefers-reduced-motion: reduce)").matches;
-    const began = performance.now();
-    const step = (now: number): void => {
-      const share = still ? 1 : Math.min(1, (now - began) / 650);
-      const eased = share < 0.5 ? 2 * share * share : 1 - 2 * (1 - share) * (1 - share);
-      controls.object.position.lerpVectors(from.position, to.position, eased);
-      controls.target.lerpVectors(from.target, to.target, eased);
-      controls.update();
-      this.stir();
-      if (share < 1) this.flight = requestAnimationFrame(step);
-      else if (animated) this.options.moved();
-    };
-    step(still ? began : performance.now());
+    this.navigation.toCamera(item);
   }
 
   private fit(): void {
     const { clientWidth: width, clientHeight: height } = this.element;
     if (width === 0 || height === 0) return;
     this.renderer.setSize(width, height);
-    this.perspective.aspect = width / height;
-    this.perspective.updateProjectionMatrix();
-    const reach = 1.1 * this.radius;
-    const across = width / height;
-    const [w, t] = across > 1 ? [reach * across, reach] : [reach, reach / across];
-    Object.assign(this.above, { left: -w, right: w, top: t, bottom: -t });
-    this.above.updateProjectionMatrix();
-    this.invalidate();
+    this.navigation.fit(width, height);
+    this.painter.invalidate();
   }
 
   // drawing
 
-  invalidate(): void {
-    if (this.asked) return;
-    this.asked = requestAnimationFrame(() => {
-      this.asked = 0;
-      this.draw();
-    });
-  }
-
-  /** Something moves: fewer points until it rests. */
-  private stir(): void {
-    clearTimeout(this.moving);
-    this.moving = setTimeout(() => {
-      this.moving = 0;
-      this.invalidate();
-    }, REST_MS) as unknown as number;
-    this.invalidate();
-  }
-
-  private draw(): void {
-    const began = performance.now();
-    if (this.points && this.cloud) this.points.geometry.setDrawRange(0, this.moving ? Math.min(MOVING_POINTS, this.cloud.count) : this.cloud.count);
-    const most = this.moving ? EDGES.moving : EDGES.rest;
-    for (const { edges, vertices } of this.edges) edges.geometry.setDrawRange(0, most * vertices);
+  private prepare(moving: boolean): void {
+    if (!moving)
+      for (const { layer, part, lines, items, most } of this.edged) {
+        if (items.length > EDGES.moving && !this.hidden.has(layer)) part.items = nearestFirst(lines, items, part.vertices, this.camera, most);
+      }
     const paths = this.layers.get("trails");
-    if (paths) paths.visible = !this.hidden.has("trails") && !(this.moving && this.scene.keyframes.length > EDGES.rest);
-    this.renderer.render(this.world, this.camera);
-    this.drawLabels();
-    this.frames.push(performance.now() - began);
-    if (this.frames.length > 200) this.frames.shift();
+    if (paths) paths.visible = !this.hidden.has("trails") && !(moving && this.scene.keyframes.length > EDGES.rest);
   }
 
-  private drawLabels(): void {
+  private drawOver(hasty = false): void {
+    this.drawLabels(hasty ? LABELS_IN_HASTE : undefined);
+    this.overlay.draw(this.camera, this.element.clientWidth, this.element.clientHeight);
+  }
+
+  /** What is over the picture changed, and nothing else. */
+  private later(): void {
+    cancelAnimationFrame(this.overlayAsked);
+    this.overlayAsked = requestAnimationFrame(() => this.drawOver());
+  }
+
+  private drawLabels(most?: number): void {
     const { clientWidth: width, clientHeight: height } = this.element;
     this.labels.element.hidden = this.hidden.has("names");
     if (this.hidden.has("names")) return;
@@ -444,9 +309,9 @@ export class Viewer {
       return spot.z > 1 || spot.z < -1 ? null : { x: ((spot.x + 1) / 2) * width, y: ((1 - spot.y) / 2) * height, far };
     };
     const chosen = this.chosenLandmarks;
-    const shown = this.hidden.has("landmarks") ? [] : this.labelled.filter((label) => !chosen.has(label.id));
     const first = this.labelled.filter((label) => chosen.has(label.id)).map((label) => ({ ...label, weight: 1e6 }));
-    this.labels.draw([...first, ...shown.slice(0, MOST_LABELLED)], project, width, height);
+    const shown = this.hidden.has("landmarks") ? [] : this.labelled.slice(0, MOST_LABELLED).filter((label) => !chosen.has(label.id));
+    this.labels.draw([...first, ...shown], project, width, height, most);
   }
 
   private makeLabels(dark: boolean, things: readonly LandmarkItem[]): Label[] {
@@ -464,41 +329,31 @@ export class Viewer {
 
   private listen(canvas: HTMLCanvasElement): void {
     let down: { x: number; y: number } | null = null;
+    let hovering = 0;
     canvas.addEventListener("pointerdown", (event) => (down = { x: event.offsetX, y: event.offsetY }));
     canvas.addEventListener("pointerup", (event) => {
       if (!down || Math.hypot(event.offsetX - down.x, event.offsetY - down.y) > 4) return;
       this.options.picked(this.pick(event.offsetX, event.offsetY, event.pointerType === "touch" ? 20 : 11));
     });
     canvas.addEventListener("pointermove", (event) => {
-      if (event.buttons === 0) canvas.style.cursor = this.pick(event.offsetX, event.offsetY, 9) ? "pointer" : "";
+      if (event.buttons !== 0) return;
+      cancelAnimationFrame(hovering);
+      hovering = requestAnimationFrame(() => (canvas.style.cursor = this.pick(event.offsetX, event.offsetY, 9) ? "pointer" : ""));
     });
+    canvas.addEventListener("keydown", (event) => {
+      const nearer = { "+": 0.8, "=": 0.8, "-": 1.25 }[event.key];
+      if (nearer === undefined || event.ctrlKey || event.metaKey) return;
+      event.preventDefault();
+      this.navigation.nearer(nearer);
+    });
+    canvas.addEventListener("keyup", (event) => /^Arrow|^[-+=]$/.test(event.key) && this.options.moved());
   }
 
-  /** What is at a place of the picture: the nearest keyframe within `reach` pixels, or the thing that is hit first. */
+  /** What is at a place of the picture: the nearest keyframe within `reach` pixels, or the thing that is hit. */
   pick(x: number, y: number, reach: number): Picked {
     const { clientWidth: width, clientHeight: height } = this.element;
-    const spot = new V3();
-    let best: Picked = null;
-    let least = reach;
-    if (!this.hidden.has("cameras"))
-      for (const item of this.scene.keyframes) {
-        spot.set(...item.position).project(this.camera);
-        if (spot.z > 1 || spot.z < -1) continue;
-        const off = Math.hypot(((spot.x + 1) / 2) * width - x, ((1 - spot.y) / 2) * height - y);
-        if (off < least) [least, best] = [off, { kind: "keyframe", id: item.id }];
-      }
-    if (best || this.hidden.has("landmarks")) return best;
-    const near = new V3((2 * x) / width - 1, 1 - (2 * y) / height, -1).unproject(this.camera);
-    const far = new V3((2 * x) / width - 1, 1 - (2 * y) / height, 1).unproject(this.camera);
-    const from: Vector3 = [near.x, near.y, near.z];
-    const along: Vector3 = [far.x - near.x, far.y - near.y, far.z - near.z];
-    let smallest = Infinity;
-    for (const item of this.scene.landmarks) {
-      if (!present(item) || hitBox(from, along, item) === null) continue;
-      const volume = Math.hypot(...item.size); // a cup on a table is meant, not the table
-      if (volume < smallest) [smallest, best] = [volume, { kind: "landmark", id: item.id }];
-    }
-    return best;
+    const { keyframes, landmarks } = this.scene;
+    return pick(this.camera, { width, height }, { x, y, reach }, this.hidden.has("cameras") ? [] : keyframes, this.hidden.has("landmarks") ? [] : landmarks);
   }
 
   /** Corners of a thing in pixels, for tests and pictures. */
@@ -511,15 +366,15 @@ export class Viewer {
   }
 }
 
-/** How much a thing is worth to be named: sure and large ones first. */
-function weight(item: LandmarkItem): number {
-  return item.probability * (1 + Math.cbrt(item.size[0] * item.size[1] * item.size[2]));
-}
-
 /** The same in an order of which every beginning is spread over all. */
 function scattered<T>(items: readonly T[]): T[] {
   const step = 7919; // a prime
   return items.length % step === 0 ? [...items] : items.map((_, i) => items[(i * step) % items.length] as T);
+}
+
+/** How much a thing is worth to be named: sure and large ones first. */
+function weight(item: LandmarkItem): number {
+  return item.probability * (1 + Math.cbrt(item.size[0] * item.size[1] * item.size[2]));
 }
 
 /** Whether pictures are drawn by the processor, as in machines without a graphics card. */
@@ -529,15 +384,6 @@ function isSoftware(): boolean {
   const name = gl && about ? String(gl.getParameter(about.UNMASKED_RENDERER_WEBGL)) : "";
   gl?.getExtension("WEBGL_lose_context")?.loseContext();
   return /swiftshader|llvmpipe|software|basic render/i.test(name);
-}
-
-export function present(item: LandmarkItem): boolean {
-  return item.state !== "gone";
-}
-
-function onTop(object: LineSegments): void {
-  object.renderOrder = 10;
-  (object.material as LineBasicMaterial).depthTest = false;
 }
 
 function release(object: Object3D): void {

@@ -1,15 +1,15 @@
 // Cameras that are tracked now, moving over the map.
 import { ApiError, ask, part } from "../api";
 import type { MapScene } from "../model";
-import { type Context } from "../router";
+import type { Context, Updatable } from "../router";
 import { texts } from "../texts";
 import type { Pose, Vector3 } from "../types";
 import { bdi, fill, h } from "../ui/h";
-import { command, empty, failed, show } from "../ui/parts";
+import { button, command, empty, failed, show } from "../ui/parts";
 import { mapHead } from "../ui/tabs";
-import { TopMap } from "../ui/topmap";
 import { metres, place, sigmas } from "../ui/verdict";
-import { cameraOf, sceneOfMap } from "./parts/evidence";
+import { sceneOfMap } from "./parts/evidence";
+import { type Placed, Space } from "./parts/space";
 
 interface Camera {
   camera: string;
@@ -25,18 +25,27 @@ interface Camera {
 const AGAIN_MS = 2000;
 const GOOD = ["tracking", "tracked", "localized"];
 
-export function live({ root, until, params }: Context): void {
+export function live({ root, until, params }: Context): Updatable {
   const map = params["map"] ?? "";
   document.title = texts.title(`${texts.tabs.live} · ${map}`);
   root.className = "page";
   const place = h("div");
   root.append(mapHead(map, "live"), place);
-  void show(place, until, async () => new Watching(map, await sceneOfMap(map, until), until).element);
+  let watching: Watching | null = null;
+  void show(place, until, async () => (watching = new Watching(map, await sceneOfMap(map, until), until)).element);
+  return {
+    update: (next, query) => {
+      if (next["map"] !== map) return false;
+      watching?.space.follow(query);
+      return true;
+    },
+  };
 }
 
 class Watching {
   readonly element: HTMLElement;
-  private readonly plan: TopMap;
+  readonly space: Space;
+  private readonly rows = new Map<string, Row>();
   private readonly list = h("ul", { class: "plain stack", attrs: { "aria-label": texts.live.cameras } });
   private readonly note = h("div", { attrs: { role: "status" } });
 
@@ -45,8 +54,8 @@ class Watching {
     scene: MapScene,
     private readonly until: AbortSignal,
   ) {
-    this.plan = new TopMap(scene);
-    this.element = h("div", { class: "live" }, this.plan.element, h("div", { class: "stack" }, this.note, this.list));
+    this.space = new Space(scene, until);
+    this.element = h("div", { class: "live" }, this.space.element, h("div", { class: "stack" }, this.note, this.list));
     this.draw([]);
     void this.follow();
   }
@@ -84,28 +93,55 @@ class Watching {
   private draw(cameras: readonly Camera[]): void {
     const t = texts.live;
     fill(this.note, cameras.length === 0 && empty(t.none, [t.noneHint, command(t.command(this.map, location.origin))]));
-    const kind = (one: Camera): string => (GOOD.includes(one.state) ? "localized" : one.pose ? "ambiguous" : "failed");
-    this.plan.show(
-      cameras.filter((one) => one.pose !== null).map((one) => cameraOf(one.pose as Pose, kind(one), one.covariance, one.camera)),
-      [],
-      [],
-      new Set(),
-      new Set(),
-      cameras.map((one) => one.path),
-    );
+    this.space.show(cameras.flatMap(placed));
+    const gone = new Set(this.rows.keys());
+    for (const one of cameras) {
+      gone.delete(one.camera);
+      let row = this.rows.get(one.camera);
+      if (!row) {
+        row = new Row(one.camera, (last) => placed(last).forEach((found) => this.space.flyTo(found)));
+        this.rows.set(one.camera, row);
+        this.list.append(row.element);
+        if (this.rows.size === 1 && !new URLSearchParams(location.search).has("at")) row.fly(one);
+      }
+      row.show(one);
+    }
+    for (const name of gone) {
+      this.rows.get(name)?.element.remove();
+      this.rows.delete(name);
+    }
+  }
+}
+
+function placed(one: Camera): Placed[] {
+  const verdict = GOOD.includes(one.state) ? "localized" : one.pose ? "ambiguous" : "failed";
+  return one.pose ? [{ pose: one.pose, verdict, label: one.camera, covariance: one.covariance, path: one.path }] : [];
+}
+
+/** What is said of a camera; it stays while that changes, so that its button keeps the focus. */
+class Row {
+  readonly element: HTMLElement;
+  private readonly told = h("div", { class: "stack tight" });
+  private last: Camera | null = null;
+
+  constructor(
+    name: string,
+    readonly fly: (last: Camera) => void,
+  ) {
+    const there = button(texts.landmark.fly, () => this.last && fly(this.last), { label: texts.live.flyTo(name) });
+    this.element = h("li", { class: "box" }, h("div", { class: "row" }, h("strong", { class: "grow" }, bdi(name)), there), this.told);
+  }
+
+  show(one: Camera): void {
+    this.last = one;
+    const sigma = sigmas(one.covariance);
+    const t = texts.live;
     fill(
-      this.list,
-      cameras.map((one) => {
-        const sigma = sigmas(one.covariance);
-        return h(
-          "li",
-          { class: "box" },
-          h("div", { class: "row" }, h("strong", null, bdi(one.camera)), h("span", { class: `tag ${GOOD.includes(one.state) ? "good" : one.pose ? "warn" : "bad"}` }, one.state), h("span", { class: "faint" }, t.ago(one.age_s))),
-          h("span", null, one.pose ? `${place(one.pose.position)} m${sigma ? ` ± ${metres(sigma.m)}` : ""}` : "–"),
-          h("span", { class: "faint" }, t.frames(one.frames)),
-          one.reason && h("span", { class: "faint", attrs: { dir: "auto" } }, one.reason),
-        );
-      }),
+      this.told,
+      h("div", { class: "row" }, h("span", { class: `tag ${GOOD.includes(one.state) ? "good" : one.pose ? "warn" : "bad"}` }, one.state), h("span", { class: "faint" }, t.ago(one.age_s))),
+      h("span", null, one.pose ? `${place(one.pose.position)} m${sigma ? ` ± ${metres(sigma.m)}` : ""}` : "–"),
+      h("span", { class: "faint" }, t.frames(one.frames)),
+      one.reason && h("span", { class: "faint", attrs: { dir: "auto" } }, one.reason),
     );
   }
 }

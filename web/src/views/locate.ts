@@ -1,7 +1,7 @@
 // Photos to poses: what was dropped is localized one after the other, and each answer shown with what it rests on.
 import { ApiError, ask, get, getAll, part } from "../api";
 import { type Dropped, type Photo, chosenFiles, dropped } from "../drop";
-import { type Context, go, link } from "../router";
+import { type Context, type Updatable, go, link } from "../router";
 import { texts } from "../texts";
 import type { MapInfo, Pose, SeenObject } from "../types";
 import { bdi, fill, h } from "../ui/h";
@@ -9,10 +9,10 @@ import { key } from "../ui/keys";
 import { quoted } from "../ui/quoted";
 import { a, button, command, empty, failed, show } from "../ui/parts";
 import { mapHead } from "../ui/tabs";
-import { TopMap } from "../ui/topmap";
 import { verdictTag, verdictWords } from "../ui/verdict";
-import { type Candidate, cameraOf, candidatesTable, poseFacts, sceneOfMap } from "./parts/evidence";
+import { type Candidate, candidatesTable, matchedOf, poseFacts, sceneOfMap } from "./parts/evidence";
 import { matchesFigure } from "./parts/matches";
+import { type Placed, Space } from "./parts/space";
 
 interface Answer {
   image: string;
@@ -56,7 +56,7 @@ export async function locateAnywhere({ root, until }: Context): Promise<void> {
   );
 }
 
-export function locate({ root, until, params }: Context): void {
+export function locate({ root, until, params }: Context): Updatable {
   const map = params["map"] ?? "";
   document.title = texts.title(`${texts.tabs.locate} · ${map}`);
   root.className = "page";
@@ -69,9 +69,17 @@ export function locate({ root, until, params }: Context): void {
     void state.take(found);
   }, until);
   if (results.childElementCount === 0) fill(results, empty(texts.locate.none, texts.locate.noneHint, [texts.locate.command, command(`semdb localize photo.jpg --map ${quoted(map)}`)]));
+  return {
+    update: (next, query) => {
+      if (next["map"] !== map) return false;
+      state.space?.follow(query);
+      return true;
+    },
+  };
 }
 
 class Locating {
+  space: Space | null = null;
   private results: Result[] = [];
   private chosen = 0;
   private camera = "";
@@ -205,12 +213,12 @@ class Locating {
   private async answer(result: Result, found: Answer): Promise<HTMLElement> {
     const t = texts.locate;
     const scene = await sceneOfMap(this.map, this.until);
-    const plan = new TopMap(scene, found.pose ? [found.pose.position] : []);
-    const others = this.results
-      .filter((one) => one !== result && one.answer?.pose)
-      .map((one) => ({ ...cameraOf(one.answer?.pose as Pose, one.answer?.verdict ?? ""), kind: "old" as const }));
-    const matched = new Set(found.candidates.filter((one) => one.inliers > 0).map((one) => one.keyframe));
-    plan.show([...others, ...(found.pose ? [cameraOf(found.pose, found.verdict, found.covariance, t.here)] : [])], [], [], matched);
+    const space = (this.space ??= new Space(scene, this.until));
+    const others = this.results.flatMap((one): Placed[] => (one !== result && one.answer?.pose ? [{ pose: one.answer.pose, verdict: one.answer.verdict, faint: true }] : []));
+    const matched = matchedOf(scene, found.candidates);
+    const own: Placed | null = found.pose && { pose: found.pose, verdict: found.verdict, label: t.here, covariance: found.covariance, camera: this.camera || (this.last?.camera ?? ""), by: matched.slice(0, 3) };
+    space.show([...others, ...(own ? [own] : [])], matched);
+    if (own) space.flyTo(own);
     const best = found.matches ? await get<{ camera: { width: number; height: number }; recording: string; frame_index: number }>(`/v1/keyframes/${found.matches.keyframe}`, this.until).catch(() => null) : null;
     return h(
       "div",
@@ -218,7 +226,7 @@ class Locating {
       h("div", { class: "verdict-head" }, verdictTag(found.verdict), h("strong", null, verdictWords(found.verdict))),
       h("p", { attrs: { dir: "auto" } }, t.because(found.reason)),
       best && found.matches ? await matchesFigure(result.photo.file, found.objects, found.matches, best, this.until) : h("p", { class: "faint" }, t.noMatches),
-      h("div", { class: "answer" }, plan.element, h("div", { class: "stack" }, poseFacts(found.pose, found.covariance, found.confidence, found.inliers), found.pose && this.into3d(found.pose), found.notes.length > 0 && h("div", { class: "notes" }, h("h3", null, t.assumed), h("ul", null, found.notes.map((note) => h("li", { attrs: { dir: "auto" } }, note)))))),
+      h("div", { class: "answer" }, space.element, h("div", { class: "stack" }, poseFacts(found.pose, found.covariance, found.confidence, found.inliers), found.pose && this.into3d(found.pose), found.notes.length > 0 && h("div", { class: "notes" }, h("h3", null, t.assumed), h("ul", null, found.notes.map((note) => h("li", { attrs: { dir: "auto" } }, note)))))),
       candidatesTable(this.map, found.candidates),
     );
   }

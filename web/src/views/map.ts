@@ -30,13 +30,32 @@ export async function map({ root, until, params, query }: Context): Promise<Upda
   document.title = texts.title(name);
   root.className = "map";
   fill(root, loading(texts.map.waiting));
-  const scene = sceneOf(await get<SceneColumns>(`/v1/maps/${part(name)}/scene`, until));
-  const view = new MapView(name, scene, until);
+  const asked = get<SceneColumns>(`/v1/maps/${part(name)}/scene`, until);
+  // what comes after it is asked for at once
+  const viewer = import("../scene/viewer");
+  const points = getBytes(`/v1/maps/${part(name)}/points?count=${POINTS}`, until);
+  for (const early of [viewer, points]) early.catch(() => undefined); // told where they are used
+  const scene = sceneOf(await asked);
+  const view = new MapView(name, scene, until, { viewer, points });
   if (until.aborted) return view;
   fill(root, view.element);
   view.update(params, query);
-  void view.begin(query);
+  void view.begin();
   return view;
+}
+
+/** What was asked for before the scene was there. */
+interface Early {
+  viewer: Promise<typeof import("../scene/viewer")>;
+  points: Promise<ArrayBuffer>;
+}
+
+function modeOf(query: URLSearchParams): Mode {
+  return query.get("view") === "top" ? "top" : "3d";
+}
+
+function offOf(query: URLSearchParams): Set<Layer> {
+  return new Set(query.has("off") ? ((query.get("off") ?? "").split(",") as Layer[]) : OFF_AT_FIRST);
 }
 
 class MapView implements Updatable {
@@ -48,6 +67,7 @@ class MapView implements Updatable {
   private readonly context: MapContext;
   private viewer: Viewer | null = null;
   private shown = "";
+  private at = ""; // of the address, as it was last looked at or written
   private selecting = new AbortController();
   private off: Set<Layer>;
   private mode: Mode;
@@ -58,13 +78,14 @@ class MapView implements Updatable {
     private readonly name: string,
     private readonly scene: MapScene,
     private readonly until: AbortSignal,
+    private readonly early: Early,
   ) {
     const query = new URLSearchParams(location.search);
-    this.mode = query.get("view") === "top" ? "top" : "3d";
-    this.off = new Set(query.has("off") ? ((query.get("off") ?? "").split(",") as Layer[]) : OFF_AT_FIRST);
+    this.mode = modeOf(query);
+    this.off = offOf(query);
     this.context = { name, scene, until, viewer: () => this.viewer };
     this.panel = new Panel(scene, (what) => this.select(what), until);
-    this.search = new Search(this.context, (what) => this.select(what));
+    this.search = new Search(this.context, (what, replace) => this.select(what, replace));
     this.bar = this.toolbar();
     this.stage.append(this.bar);
     this.legend = h("p", { class: "legend" }, texts.map.legend.map(([kind, text]) => h("span", null, h("span", { class: `sign ${kind}`, attrs: { "aria-hidden": "true" } }), text)));
@@ -93,15 +114,15 @@ class MapView implements Updatable {
     );
   }
 
-  async begin(query: URLSearchParams): Promise<void> {
+  async begin(): Promise<void> {
     if (this.scene.keyframes.length === 0) {
       fill(this.stage, empty(texts.map.empty, [texts.map.emptyHint, command(texts.map.emptyCommand(this.name))]));
       return;
     }
     try {
-      const { Viewer } = await import("../scene/viewer");
+      const { Viewer } = await this.early.viewer;
       if (this.until.aborted) return;
-      this.viewer = new Viewer(this.scene, { picked: (what) => this.select(what), moved: () => this.remember() });
+      this.viewer = new Viewer(this.scene, { picked: (what) => this.select(what), moved: () => this.remember() }, this.off);
     } catch {
       fill(this.stage, empty(texts.map.noWebgl));
       return;
@@ -110,18 +131,14 @@ class MapView implements Updatable {
     Object.assign(viewer.element, { viewer }); // for those who measure
     viewer.canvas.setAttribute("aria-label", `${texts.map.scene(this.name)}. ${texts.map.sceneKeys}`);
     fill(this.stage, viewer.element, this.bar, this.legend);
-    for (const layer of LAYER_NAMES) viewer.show(layer, !this.off.has(layer));
     if (this.mode === "top") viewer.setMode("top");
     theme.watch(() => {
       viewer.build();
       this.highlight();
     }, this.until);
-    const at = (query.get("at") ?? "").split(",").map(Number);
-    const [x, y, z, u, v, w, zoom] = at as [number, number, number, number, number, number, number];
-    if (at.length === 7 && at.every(Number.isFinite)) viewer.state = { position: [x, y, z], target: [u, v, w], zoom };
-    else this.fly();
+    this.look(new URLSearchParams(location.search));
     try {
-      const points = pointsOf(await getBytes(`/v1/maps/${part(this.name)}/points?count=${POINTS}`, this.until));
+      const points = pointsOf(await this.early.points);
       if (!this.until.aborted) viewer.setPoints(points);
     } catch (error) {
       if (!isAbort(error)) toast(texts.map.noPoints);
@@ -132,15 +149,32 @@ class MapView implements Updatable {
   update(params: Readonly<Record<string, string>>, query: URLSearchParams): boolean {
     if (params["map"] !== this.name) return false;
     this.search.follow(query);
-    const mode: Mode = query.get("view") === "top" ? "top" : "3d";
-    if (mode !== this.mode) this.applyMode(mode);
+    this.panel.follow(query);
+    const turned = modeOf(query) !== this.mode;
+    if (turned) this.applyMode(modeOf(query));
+    this.applyOff(offOf(query));
     const wanted = `${params["keyframe"] ?? ""}/${params["landmark"] ?? ""}`;
-    if (wanted === this.shown) return true;
-    this.shown = wanted;
-    this.showDetail(params);
-    this.highlight();
-    if (this.viewer && !query.has("at")) this.fly();
+    const other = wanted !== this.shown;
+    if (other) {
+      this.shown = wanted;
+      this.showDetail(params);
+      this.highlight();
+    }
+    if (other || turned || (query.get("at") ?? "") !== this.at) this.look(query);
     return true;
+  }
+
+  /** Goes to where the address says that one looks from: a place, what is selected, or all of the map. */
+  private look(query: URLSearchParams): void {
+    const { viewer } = this;
+    if (!viewer) return;
+    const before = this.at;
+    this.at = query.get("at") ?? "";
+    const at = this.at.split(",").map(Number);
+    const [x, y, z, u, v, w, zoom] = at as [number, number, number, number, number, number, number];
+    if (at.length === 7 && at.every(Number.isFinite)) viewer.state = { position: [x, y, z], target: [u, v, w], zoom };
+    else if (this.shown !== "/") this.fly();
+    else if (before !== "") viewer.home();
   }
 
   private params(): { keyframe?: number; landmark?: number } {
@@ -194,30 +228,50 @@ class MapView implements Updatable {
   }
 
   /** Goes to the address of what was clicked; the question and the layers stay. */
-  private select(what: Picked): void {
-    const query = new URLSearchParams(location.search);
-    query.delete("at");
-    const kept = Object.fromEntries(query);
-    if (what === null) go(link(["maps", this.name], kept));
-    else go(link(["maps", this.name, what.kind === "keyframe" ? "keyframes" : "landmarks", what.id], kept));
+  private select(what: Picked, replace = false): void {
+    const kept = Object.fromEntries(new URLSearchParams(location.search));
+    if (what === null) return go(link(["maps", this.name], kept)); // one looks from where one looked
+    delete kept["at"];
+    go(link(["maps", this.name, what.kind === "keyframe" ? "keyframes" : "landmarks", what.id], kept), replace);
   }
 
   private remember(): void {
     if (!this.viewer || this.until.aborted) return;
     const { position, target, zoom } = this.viewer.state;
-    setQuery({ at: [...position, ...target, zoom].map((value) => Number(value.toFixed(3))).join(",") });
+    this.at = [...position, ...target, zoom].map((value) => Number(value.toFixed(3))).join(",");
+    setQuery({ at: this.at });
   }
 
   private setMode(mode: Mode): void {
-    setQuery({ view: mode === "top" ? "top" : null, at: null });
+    setQuery({ view: mode === "top" ? "top" : null, at: null }, false);
   }
 
   private applyMode(mode: Mode): void {
     this.mode = mode;
     this.viewer?.setMode(mode);
+    this.renewBar();
+  }
+
+  private applyOff(off: ReadonlySet<Layer>): void {
+    const changed = LAYER_NAMES.filter((layer) => off.has(layer) !== this.off.has(layer));
+    if (changed.length === 0) return;
+    this.off = new Set(off);
+    for (const layer of changed) this.viewer?.show(layer, !off.has(layer));
+    for (const layer of changed) {
+      const box = this.bar.querySelector<HTMLInputElement>(`input[name="${layer}"]`);
+      if (box) box.checked = !off.has(layer);
+    }
+  }
+
+  private renewBar(): void {
+    const open = this.bar.querySelector("details")?.open ?? false;
     const anew = this.toolbar();
+    const layers = anew.querySelector("details");
+    if (layers) layers.open = open;
+    const focused = this.bar.contains(document.activeElement);
     this.bar.replaceWith(anew);
     this.bar = anew;
+    if (focused) anew.querySelector<HTMLElement>("[aria-pressed=true]")?.focus();
   }
 
   private toolbar(): HTMLElement {
@@ -237,7 +291,7 @@ class MapView implements Updatable {
         "label",
         { class: "inline" },
         h("input", {
-          attrs: { type: "checkbox", checked: !this.off.has(layer) },
+          attrs: { type: "checkbox", name: layer, checked: !this.off.has(layer) },
           on: { change: (event) => this.toggle(layer, (event.target as HTMLInputElement).checked) },
         }),
         h("span", { class: `swatch ${layer}`, attrs: { "aria-hidden": "true" } }),
@@ -250,11 +304,11 @@ class MapView implements Updatable {
   }
 
   private toggle(layer: Layer, on: boolean): void {
-    if (on) this.off.delete(layer);
-    else this.off.add(layer);
-    this.viewer?.show(layer, on);
-    const usual = this.off.size === OFF_AT_FIRST.length && OFF_AT_FIRST.every((name) => this.off.has(name));
-    setQuery({ off: usual ? null : [...this.off].join(",") || "none" });
+    const off = new Set(this.off);
+    if (on) off.delete(layer);
+    else off.add(layer);
+    const usual = off.size === OFF_AT_FIRST.length && OFF_AT_FIRST.every((name) => off.has(name));
+    setQuery({ off: usual ? null : [...off].join(",") || "none" }, false);
   }
 }
 

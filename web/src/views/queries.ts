@@ -8,7 +8,8 @@ import { key } from "../ui/keys";
 import { a, button, empty, failed, loading, show } from "../ui/parts";
 import { mapHead } from "../ui/tabs";
 import { moment, verdictTag, verdictWords } from "../ui/verdict";
-import { candidatesTable, planOf, poseFacts } from "./parts/evidence";
+import { candidatesTable, matchedOf, poseFacts, sceneOfMap } from "./parts/evidence";
+import { type Placed, Space } from "./parts/space";
 
 const FILTERS = ["verdict", "text", "since", "until", "keyframe"] as const;
 const VERDICTS = ["localized", "ambiguous", "coarse", "failed"];
@@ -124,17 +125,23 @@ function row(map: string, one: LoggedQuery): HTMLElement {
 }
 
 /** One localization of the log. */
-export function query({ root, until, params }: Context): void {
+export function query({ root, until, params }: Context): Updatable {
   const map = params["map"] ?? "";
   const id = params["query"] ?? "";
   document.title = texts.title(texts.queries.one(id));
   root.className = "page";
   const place = h("div");
+  let space: Space | null = null;
   root.append(mapHead(map, "queries"), place);
   void show(place, until, async () => {
     const found = await get<LoggedQuery & { map: string }>(`/v1/queries/${part(id)}`, until);
     if (found.map !== map) go(link(["maps", found.map, "queries", id]), true); // its places are of that map
-    const plan = await planOf(map, found.verdict, found.pose, null, found.candidates, until);
+    const scene = await sceneOfMap(found.map, until);
+    const matched = matchedOf(scene, found.candidates);
+    const own: Placed | null = found.pose && { pose: found.pose, verdict: found.verdict, by: matched.slice(0, 3) };
+    space = new Space(scene, until);
+    space.show(own ? [own] : [], matched);
+    if (own) space.flyTo(own);
     return h(
       "div",
       { class: "stack" },
@@ -142,10 +149,17 @@ export function query({ root, until, params }: Context): void {
       h("h2", null, bdi(found.image), " ", verdictTag(found.verdict)),
       h("p", null, verdictWords(found.verdict)),
       h("p", { attrs: { dir: "auto" } }, found.reason),
-      h("div", { class: "answer" }, plan, h("div", { class: "stack" }, poseFacts(found.pose, null, found.confidence, found.inliers), h("p", { class: "faint" }, `${moment(found.created_at)} · ${texts.queries.notKept}`), timing(found.timing_ms))),
+      h("div", { class: "answer" }, space.element, h("div", { class: "stack" }, poseFacts(found.pose, null, found.confidence, found.inliers), h("p", { class: "faint" }, `${moment(found.created_at)} · ${texts.queries.notKept}`), timing(found.timing_ms))),
       candidatesTable(map, found.candidates),
     );
   });
+  return {
+    update: (next, chosen) => {
+      if (next["map"] !== map || next["query"] !== id) return false;
+      space?.follow(chosen);
+      return true;
+    },
+  };
 }
 
 function timing(found: Record<string, number | null>): HTMLElement {

@@ -1,11 +1,14 @@
 // Lists of what is in a map.
 import { type KeyframeItem, type LandmarkItem, type MapScene, css, hueColour } from "../../model";
 import type { Picked } from "../../scene/viewer";
+import { setQuery } from "../../router";
 import { texts } from "../../texts";
 import { bdi, fill, h } from "../../ui/h";
 import { VirtualList } from "../../ui/list";
 import { command, empty } from "../../ui/parts";
 import { theme } from "../../ui/theme";
+
+type Tab = "things" | "frames";
 
 export class Panel {
   readonly element = h("div", { class: "panel" });
@@ -15,7 +18,8 @@ export class Panel {
   private readonly body = h("div", { class: "panel-body", attrs: { role: "tabpanel" } });
   private readonly tabs: HTMLButtonElement[];
   private readonly filter: HTMLInputElement;
-  private tab: "things" | "frames" = "things";
+  private tab: Tab | null = null;
+  private readonly usual: Tab;
   private marked: { keyframe?: number; landmark?: number } = {};
 
   constructor(
@@ -27,22 +31,37 @@ export class Panel {
     this.listed = { things, frames: scene.keyframes };
     this.things = new VirtualList<LandmarkItem>({ rowHeight: 44, label: texts.map.things, row: thingRow, chosen: (item) => chosen({ kind: "landmark", id: item.id }) });
     this.frames = new VirtualList<KeyframeItem>({ rowHeight: 44, label: texts.map.keyframes, row: frameRow, chosen: (item) => chosen({ kind: "keyframe", id: item.id }) });
-    this.filter = h("input", { attrs: { type: "search" }, on: { input: () => this.list() } });
+    this.filter = h("input", { attrs: { type: "search" }, on: { input: () => this.filtered() } });
     this.tabs = (["things", "frames"] as const).map((name) =>
-      h("button", { attrs: { type: "button", role: "tab" }, on: { click: () => this.open(name) } }, name === "things" ? texts.map.things : texts.map.keyframes),
+      h("button", { attrs: { type: "button", role: "tab" }, on: { click: () => setQuery({ list: name === this.usual ? null : name, filter: null }, false) } }, name === "things" ? texts.map.things : texts.map.keyframes),
     );
     this.element.append(h("div", { class: "panel-tabs", attrs: { role: "tablist" } }, this.tabs), h("div", { class: "panel-filter" }, this.filter), this.body);
     theme.watch(() => this.list(), until);
-    this.open(scene.landmarks.length > 0 || scene.keyframes.length === 0 ? "things" : "frames");
+    this.usual = scene.landmarks.length > 0 || scene.keyframes.length === 0 ? "things" : "frames";
+    this.follow(new URLSearchParams(location.search));
   }
 
-  private open(tab: "things" | "frames"): void {
+  /** Which list, and what of it, is in the address. */
+  follow(query: URLSearchParams): void {
+    const named = query.get("list");
+    const tab: Tab = named === "things" || named === "frames" ? named : this.usual;
+    const wanted = query.get("filter") ?? "";
+    if (tab === this.tab && wanted === this.filter.value) return;
+    if (wanted !== this.filter.value) this.filter.value = wanted;
+    this.open(tab);
+  }
+
+  private filtered(): void {
+    setQuery({ filter: this.filter.value });
+    this.list();
+  }
+
+  private open(tab: Tab): void {
     this.tab = tab;
     this.tabs.forEach((button, index) => button.setAttribute("aria-selected", String((index === 0) === (tab === "things"))));
     const label = tab === "things" ? texts.map.filter : texts.map.filterKeyframes;
     this.filter.placeholder = label;
     this.filter.setAttribute("aria-label", label);
-    this.filter.value = "";
     this.list();
   }
 

@@ -37,7 +37,7 @@ export class Search {
 
   constructor(
     private readonly context: MapContext,
-    private readonly select: (what: Picked) => void,
+    private readonly select: (what: Picked, replace?: boolean) => void,
   ) {
     this.input = h("input", { attrs: { type: "search", placeholder: texts.search.placeholder, "aria-label": texts.search.label, autocomplete: "off" } });
     const form = h(
@@ -96,7 +96,7 @@ export class Search {
       fill(this.results, this.shown(found));
       const best = found.hits[0];
       const selected = /\/(keyframes|landmarks)\//.test(location.pathname);
-      if (best && !selected) this.select({ kind: "landmark", id: best.landmark });
+      if (best && !selected) this.select({ kind: "landmark", id: best.landmark }, true);
     } catch (error) {
       if (!until.aborted && !isAbort(error)) fill(this.results, failed(error, () => void this.ask(question, until)));
     }

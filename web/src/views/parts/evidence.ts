@@ -1,12 +1,12 @@
 // What an answer rests on: the pose in words, the keyframes that were looked at, the place in the map.
 import { get, load, part } from "../../api";
-import { type MapScene, type SceneColumns, axesOf, sceneOf } from "../../model";
+import { type KeyframeItem, type MapScene, type SceneColumns, sceneOf } from "../../model";
 import { link } from "../../router";
 import { texts } from "../../texts";
 import type { Pose } from "../../types";
 import { bdi, h } from "../../ui/h";
 import { a } from "../../ui/parts";
-import { type Shown, TopMap } from "../../ui/topmap";
+import type { Shown } from "../../ui/topmap";
 import { metres, place, sigmas } from "../../ui/verdict";
 
 export interface Candidate {
@@ -35,19 +35,10 @@ export function kindOf(verdict: string): Shown["kind"] {
   return verdict === "localized" ? "good" : verdict === "failed" ? "bad" : "warn";
 }
 
-export function cameraOf(pose: Pose, verdict: string, covariance: number[][] | null = null, label?: string): Shown {
-  const [w, x, y, z] = pose.quat_wxyz;
-  const sigma = sigmas(covariance)?.m;
-  return { position: pose.position, forward: axesOf(w, x, y, z)[2], kind: kindOf(verdict), ...(sigma === undefined ? {} : { sigma }), ...(label === undefined ? {} : { label }) };
-}
-
-/** The map from above with the camera, and the keyframes that were matched. */
-export async function planOf(map: string, verdict: string, pose: Pose | null, covariance: number[][] | null, candidates: readonly Candidate[], until?: AbortSignal): Promise<SVGSVGElement> {
-  const scene = await sceneOfMap(map, until);
-  const drawn = new TopMap(scene, pose ? [pose.position] : []);
-  const matched = new Set(candidates.filter((one) => one.inliers > 0).map((one) => one.keyframe));
-  drawn.show(pose ? [cameraOf(pose, verdict, covariance)] : [], [], [], matched);
-  return drawn.element;
+/** Keyframes that an answer rests on, those with most matches first. */
+export function matchedOf(scene: MapScene, candidates: readonly Candidate[]): KeyframeItem[] {
+  const found = candidates.filter((one) => one.inliers > 0).sort((a, b) => b.inliers - a.inliers);
+  return found.map((one) => scene.keyframe(one.keyframe)).filter((item) => item !== undefined);
 }
 
 export function poseFacts(pose: Pose | null, covariance: number[][] | null, confidence: number | null, inliers: number): HTMLElement {

@@ -1,15 +1,13 @@
-"""The page of the service in Chromium: each use of it on a small map, one on MySQL. Screenshots are kept.
+"""Each use of the page but maps themselves, in Chromium. Screenshots are kept.
 
 Nothing but the service is reached, nothing is complained of, axe finds nothing serious.
 """
 
 from __future__ import annotations
 
-import base64
 import csv
 import re
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, urlencode
@@ -23,70 +21,33 @@ import semdb
 from semdb.database import schema
 from semdb.database.engine import make_engine
 from semdb.database.store import open_store
-from semdb.recordings.synthetic import SyntheticOptions
 from semdb.service.settings import ServeSettings
 from semdb.types import Frame
-from tests.browsing import Visit, chromium, visiting
-from tests.integration.opened import opener
+from tests.browsing import Visit, visiting
+from tests.integration.page.helpers import WORSE, World, drawn, dropped, photo_of, viewer
 from tests.integration.test_changes import stored
-from tests.rooms import render
-from tests.serving import Served, form_of, png, running
-
-HOSTILE = "<img src=x onerror=alert(1)> \"quoted\" 'and' \u202eright to left\u202c مطبخ &amp;"
-ROOM = SyntheticOptions(frames=12, width=320, height=240, lap_frames=40)
+from tests.serving import form_of, png, running
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as found:
-        yield found
+def place_of(page: Any) -> np.ndarray:
+    return np.array([float(part) for part in page.inner_text(".facts dd >> nth=0").split(",")])
 
 
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return render(tmp_path_factory.mktemp("page") / "kitchen", ROOM)
+def form_for(world: World, frame: Frame, **options: Any) -> tuple[dict[str, str], dict[str, Any]]:
+    """A frame as a form; without masks where the recording brings none."""
+    form, files = form_of(frame, **options)
+    if not world.needs_masks:
+        form.pop("categories", None)
+        files.pop("instances", None)
+    return form, files
 
 
-@pytest.fixture(scope="module")
-def served(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    """The map "office" of a rendered room, and one of made-up rows that changed, whose names are hostile."""
-    folder = tmp_path_factory.mktemp("served")
-    roots = folder / "roots"
-    (roots / "broken").mkdir(parents=True)
-    with opener(f"sqlite:///{folder / 'a.sqlite3'}", folder / "cache") as opening:
-        database = opening(detector="auto", encoder="auto", features="auto")
-        database.ingest(recording, map="office", stride=3)
-        database.refine("office", steps=["landmarks"])
-        with running(database, ServeSettings(ingest_roots=str(roots))) as found:
-            yield found
-
-
-@pytest.fixture
-def visit(browser: Any, served: Served) -> Iterator[Visit]:
-    with visiting(browser, served.url) as found:
-        yield found
-
-
-def dropped(visit: Visit, files: dict[str, bytes], where: str = "body") -> None:
-    """Drops files onto the page, as a person does."""
-    packed = {name: base64.b64encode(content).decode() for name, content in files.items()}
-    visit.page.evaluate(
-        """([files, where]) => {
-            const data = new DataTransfer();
-            for (const [name, text] of Object.entries(files))
-                data.items.add(new File([Uint8Array.from(atob(text), c => c.charCodeAt(0))], name));
-            for (const kind of ["dragenter", "dragover", "drop"])
-                document.querySelector(where).dispatchEvent(
-                    new DragEvent(kind, {dataTransfer: data, bubbles: true, cancelable: true}));
-        }""",
-        [packed, where],
-    )
-
-
-def test_a_folder_that_is_chosen_is_localized_photo_by_photo(visit: Visit, recording: Path) -> None:
+def test_a_folder_that_is_chosen_is_localized_photo_by_photo(visit: Visit, world: World, tmp_path: Path) -> None:
+    if world.name != "small-sqlite":
+        pytest.skip("folders are large there; photos are dropped")
     page = visit.page
-    visit.go("/maps/office/locate")
-    page.set_input_files("input[aria-label='A folder']", str(recording))
+    visit.go(world.address("locate"))
+    page.set_input_files("input[aria-label='A folder']", str(world.recording))
     page.wait_for_selector("text=/\\d+ of 12 localized/")
     assert page.locator(".result").count() == 12
     assert int(re.findall(r"(\d+) of 12 localized", page.inner_text(".results"))[0]) >= 10
@@ -94,42 +55,53 @@ def test_a_folder_that_is_chosen_is_localized_photo_by_photo(visit: Visit, recor
     page.wait_for_selector("figure.matches svg path")
     assert page.locator("figure.matches svg path").count() >= 12
     assert "can be relied on" in page.inner_text(".result-detail")
-    assert page.locator(".topmap .camera.good").count() == 1
-    place = [float(part) for part in page.inner_text(".facts dd >> nth=0").split(",")]
-    pose = np.loadtxt(recording / "groundtruth.txt")[4, 1:4]
-    assert np.abs(np.array(place) - pose).max() < 0.05
-    visit.shot("locate")
+    assert "no masks" not in page.inner_text(".result-detail")
+    pose = np.loadtxt(world.recording / "groundtruth.txt")[4, 1:4]
+    assert np.abs(place_of(page) - pose).max() < 0.05
     visit.check_accessible("locate")
     page.keyboard.press("j")
     page.wait_for_selector(".result-list li:nth-child(6) .result[aria-current]")
 
 
-def test_a_photo_that_is_dropped_anywhere_is_localized_without_masks(visit: Visit, recording: Path) -> None:
-    photo = sorted((recording / "rgb").iterdir())[2].read_bytes()
-    visit.go("/maps/office/queries")
-    dropped(visit, {"photo.png": photo})
-    visit.page.wait_for_url("**/maps/office/locate")
-    visit.page.wait_for_selector("text=1 of 1 localized")
-    visit.page.wait_for_selector("figure.matches svg path")
-    told = visit.page.inner_text(".result-detail")
-    assert "the image has no masks of its own: nothing is filtered by class" in told
-    assert "localized without objects" in told
-    place = [float(part) for part in visit.page.inner_text(".facts dd >> nth=0").split(",")]
-    assert np.abs(np.array(place) - np.loadtxt(recording / "groundtruth.txt")[2, 1:4]).max() < 0.05
-    visit.shot("locate-photo")
+def test_photos_that_are_dropped_anywhere_are_localized_and_drawn(visit: Visit, world: World) -> None:
+    page, photos = visit.page, world.photos[1:3]
+    visit.go(world.address("queries"))
+    dropped(visit, {f"photo {k}.png": photo_of(frame) for k, frame in enumerate(photos)})
+    page.wait_for_url("**/locate*")
+    page.wait_for_selector("text=2 of 2 localized")
+    page.wait_for_selector("figure.matches svg path")
+    told = page.inner_text(".result-detail")
+    assert ("the image has no masks of its own: nothing is filtered by class" in told) == world.needs_masks
+    assert np.abs(place_of(page) - photos[0].world_from_camera[:3, 3]).max() < 0.1
+    # its camera is drawn in space, and one stands behind it
+    assert viewer(page, "viewer.overlay.names.map(name => name.text)") == ["here"]
+    page.wait_for_function("() => location.search.includes('at=')")
+    eye = np.array(viewer(page, "viewer.state.position"))
+    assert 0.5 < np.linalg.norm(eye - photos[0].world_from_camera[:3, 3]) < 1.5
+    drawn(page)
+    visit.shot(f"locate-{world.name}")
+    page.keyboard.press("v")
+    page.wait_for_url("**view=top*")
+    assert viewer(page, "viewer.mode") == "top"
+    drawn(page)
+    page.locator(".space").screenshot(path=str(visit.shot("locate-above").with_name(f"locate-above-{world.name}.png")))
+    page.go_back()
+    page.wait_for_function("() => document.querySelector('.viewer').viewer.mode === '3d'")
+    page.keyboard.press("j")
+    page.wait_for_selector(".result-list li:nth-child(2) .result[aria-current]")
     dropped(visit, {"notes.txt": b"no photo"})
-    visit.page.wait_for_selector("text=There is no PNG or JPEG photo in that.")
+    page.wait_for_selector("text=There is no PNG or JPEG photo in that.")
 
 
-def test_the_log_is_filtered_and_each_query_shown(visit: Visit, served: Served, frames_of: list[Frame]) -> None:
-    names = ["shelf.png", HOSTILE]
-    for k, name in enumerate(names):
-        form, files = form_of(frames_of[4 + k], name=name)
-        assert served.client.post("/v1/maps/office/localize", data=form, files=files).status_code == 200
+def test_the_log_is_filtered_and_each_query_shown(visit: Visit, world: World) -> None:
+    names = ["shelf.png", WORSE]
+    for frame, name in zip(world.photos[1:3], names, strict=True):
+        form, files = form_for(world, frame, name=name)
+        assert world.served.client.post(world.api("localize"), data=form, files=files).status_code == 200
     page = visit.page
-    visit.go("/maps/office/queries")
+    visit.go(world.address("queries"))
     page.wait_for_selector("table.data")
-    assert HOSTILE in page.locator("table.data td:nth-child(2)").all_text_contents()
+    assert WORSE in page.locator("table.data td:nth-child(2)").all_text_contents()
     assert page.locator("main img[src=x]").count() == 0
     visit.shot("queries")
     visit.check_accessible("queries")
@@ -142,8 +114,8 @@ def test_the_log_is_filtered_and_each_query_shown(visit: Visit, served: Served, 
     page.click("button:has-text('Clear')")
     page.wait_for_selector("td:has-text('shelf.png')")
     page.locator("tr:has-text('shelf.png') a").first.click()
-    page.wait_for_url(re.compile(r"/maps/office/queries/\d+"))
-    page.wait_for_selector(".topmap .camera.good")
+    page.wait_for_url(re.compile(r"/queries/\d+"))
+    page.wait_for_function("() => document.querySelector('.viewer')?.viewer?.overlay.extras.length > 0")
     assert page.locator(".strip li").count() >= 1
     visit.shot("query")
     visit.check_accessible("query")
@@ -182,10 +154,10 @@ def test_statements_are_asked_with_the_schema_at_hand(visit: Visit, tmp_path: Pa
     page.wait_for_selector("th:has-text('<b>bold</b>')")
 
 
-def test_recordings_are_ingested_and_tried_again(visit: Visit, served: Served) -> None:
+def test_recordings_are_ingested_and_tried_again(visit: Visit, world: World) -> None:
     page = visit.page
-    visit.go("/maps/office/ingest")
-    page.wait_for_selector("td:has-text('kitchen')")
+    visit.go(world.address("ingest"))
+    page.wait_for_selector(f"td:has-text('{world.recording.name}')")
     page.click("button[aria-label='Ingest broken']")
     page.wait_for_selector(".job .tag.bad")
     page.click("button[aria-label='Try again: broken']")
@@ -197,29 +169,27 @@ def test_recordings_are_ingested_and_tried_again(visit: Visit, served: Served) -
     assert "room" in page.inner_text(".job >> nth=0")
 
 
-def test_cameras_move_in_the_map(visit: Visit, served: Served, frames_of: list[Frame]) -> None:
+def test_cameras_move_in_the_map(visit: Visit, world: World) -> None:
     page = visit.page
-    visit.go("/maps/office/live")
+    visit.go(world.address("live"))
     page.wait_for_selector("text=No camera is live in this map")
-    session = served.client.post("/v1/maps/office/sessions", json={}).json()
-    for k in (4, 5):
-        form, files = form_of(frames_of[k], depth=True)
-        answer = served.client.post(session["frames"], data=form, files=files)
+    client, positions = world.served.client, []
+    session = client.post(world.api("sessions"), json={}).json()
+    for k, frame in enumerate(world.photos[1:3]):
+        form, files = form_for(world, frame, depth=True)
+        answer = client.post(session["frames"], data=form, files=files)
         assert answer.json()["pose"] is not None, answer.text
-    page.wait_for_selector("text=2 frames")
-    assert page.locator(".topmap .camera .body").count() == 1
-    assert page.locator(".topmap .trail").count() == 1
-    visit.shot("live")
+        page.wait_for_selector(f"text={k + 1} frame")
+        positions.append(viewer(page, "viewer.overlay.extras[0].places[0]"))
+    assert positions[0] != positions[1]  # it moves
+    assert np.abs(np.array(positions[1]) - world.photos[2].world_from_camera[:3, 3]).max() < 0.1
+    page.locator(".live .box button").focus()
+    page.keyboard.press("Enter")
+    drawn(page)
+    visit.shot(f"live-{world.name}")
     visit.check_accessible("live")
-    served.client.delete(session["frames"].removesuffix("/frames"))
+    client.delete(session["frames"].removesuffix("/frames"))
     page.wait_for_selector("text=No camera is live in this map")
-
-
-@pytest.fixture(scope="module")
-def frames_of(recording: Path) -> list[Frame]:
-    from semdb.recordings import open_recording
-
-    return list(open_recording(recording).frames())
 
 
 def changed(url: str, folder: Path) -> Any:
@@ -234,7 +204,7 @@ def changed(url: str, folder: Path) -> Any:
             connection.execute(
                 statement("UPDATE keyframe_images SET rgb = :file, rgb_format = 'png'"), {"file": picture}
             )
-            connection.execute(statement("UPDATE maps SET name = :name"), {"name": HOSTILE})
+            connection.execute(statement("UPDATE maps SET name = :name"), {"name": WORSE})
     return semdb.open(url, cache_dir=folder, say=lambda line: None)
 
 
@@ -243,8 +213,8 @@ def looked_at_changes(browser: Any, url: str, database: Any, name: str) -> None:
         page = visit.page
         visit.go("/maps")
         page.wait_for_selector("h2")
-        assert HOSTILE in page.locator(".card h2").all_text_contents()
-        visit.go(f"/maps/{quote(HOSTILE, safe='')}/changes")
+        assert WORSE in page.locator(".card h2").all_text_contents()
+        visit.go(f"/maps/{quote(WORSE, safe='')}/changes")
         page.wait_for_selector(".change")
         assert page.inner_text(".chip >> nth=1") == "moved 1"
         assert "moved by 500 mm" in page.inner_text(".change >> nth=0") or "0.50 m" in page.inner_text(
@@ -268,21 +238,22 @@ def test_visits_are_compared_on_mysql(browser: Any, mysql_url: str, tmp_path: Pa
 
 
 @pytest.mark.parametrize("dark", [True, False], ids=["dark", "light"])
-def test_every_view_is_accessible_on_a_phone_too(browser: Any, served: Served, dark: bool) -> None:
-    views = ["maps", "maps/office/locate", "maps/office/queries", "sql", "maps/office/ingest", "maps/office/live"]
-    with visiting(browser, served.url, phone=dark, dark=dark) as visit:
-        for view in views:
-            visit.go(f"/{view}")
-            visit.page.wait_for_timeout(400)  # for what comes a little later
-            visit.shot(f"{view.replace('/', '-')}-{'phone-dark' if dark else 'light'}")
+def test_every_view_is_accessible_on_a_phone_too(browser: Any, world: World, dark: bool) -> None:
+    pages = {view: world.address(view) for view in ("locate", "queries", "ingest", "live", "changes")}
+    with visiting(browser, world.url, phone=dark, dark=dark) as visit:
+        for view, path in {"maps": "/maps", "sql": "/sql"}.items() | pages.items():
+            visit.go(path)
+            visit.page.wait_for_load_state("networkidle" if view != "live" else "load")
+            visit.settle()
+            visit.shot(f"{view}-{'phone-dark' if dark else 'light'}")
             visit.check_accessible(view)
             if dark:
                 wide = visit.page.evaluate("document.documentElement.scrollWidth - innerWidth")
                 assert wide <= 0, f"{view} is {wide} pixels wider than a phone"
 
 
-def test_the_first_paint_is_soon_and_little_is_sent(browser: Any, served: Served) -> None:
-    with visiting(browser, served.url) as visit:
+def test_the_first_paint_is_soon_and_little_is_sent(browser: Any, world: World) -> None:
+    with visiting(browser, world.url) as visit:
         sent: list[int] = []
         visit.page.on("response", lambda answer: sent.append(int(answer.headers.get("content-length", 0))))
         started = time.monotonic()
