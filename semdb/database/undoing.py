@@ -40,6 +40,7 @@ from semdb.database.tables import (
 )
 from semdb.errors import DatabaseError, UsageError
 from semdb.geometry import invert_pose
+from semdb.shown import for_shell
 from semdb.types import FloatArray
 
 
@@ -147,9 +148,11 @@ def _before(connection: Connection, operation: PoseOperation) -> dict[int, Float
             for prefix in ("before_", "after_", "now_")
         )
         if np.abs(after - present).max() > SAME:
+            name = connection.execute(select(maps.c.name).where(maps.c.id == operation.map_id)).scalar()
+            how = "" if name is None else f": {for_shell(['semdb', 'align', '--undo', '--map', str(name)])}"
             raise UsageError(
                 f"{where} was moved again after operation {operation.id} ({operation.kind} of "
-                f"{operation.created_at:%Y-%m-%d %H:%M}): take the later one back first"
+                f"{operation.created_at:%Y-%m-%d %H:%M}): take the later one back first{how}"
             )
         found[int(row.keyframe_id)] = before
     return found

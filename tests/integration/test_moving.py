@@ -304,7 +304,9 @@ def test_later_moves_are_taken_back_first(store: Store) -> None:
     move(store.engine, Move(OperationKind.REFINE, map_id, before, after))
     second, first = list_operations(store.engine, map_id)
     assert (second.kind, second.recording_id) == (OperationKind.REFINE, None)
-    with pytest.raises(UsageError, match=r"was moved again after operation .*take the later one back first"):
+    with pytest.raises(
+        UsageError, match=r"was moved again after operation .*take the later one back first: semdb align --undo --map "
+    ):
         undo(store.engine, first)
     assert undo(store.engine, second) == len(ids)
     assert undo(store.engine, first) == len(ids)
