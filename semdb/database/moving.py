@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
-from sqlalchemy import Connection, Engine, bindparam, delete, func, insert, select, update
+from sqlalchemy import ColumnElement, Connection, Engine, bindparam, delete, func, insert, select, update
 from sqlalchemy.exc import IntegrityError
 
 from semdb.database import retry
@@ -78,7 +78,8 @@ def move_within(connection: Connection, wanted: Move, token: str) -> int:
     rows = _present(connection, {**wanted.relied_on, **wanted.before})
     _hold_poses(connection, rows)
     say_moved(connection, [*(row.recording_id for row in rows.values()), *(r.recording_id for r in wanted.recordings)])
-    if wanted.counted is not None and _held(connection, wanted.map_id) != wanted.counted:
+    there_now = keyframes.c.recording_id.in_(select(recordings.c.id).where(recordings.c.map_id == wanted.map_id))
+    if wanted.counted is not None and _now(connection, there_now) != wanted.counted:
         raise DatabaseError(
             f"keyframes came into the map {there!r}, or left it, meanwhile, nothing is changed: run it again"
         )
@@ -111,9 +112,10 @@ def _map_of(connection: Connection, map_id: int) -> str:
 
 
 def hold(connection: Connection, one: MovedRecording) -> None:
-    """Waits for those who store keyframes of a recording, and makes others wait. Raises UsageError, NotFoundError.
+    """Waits for those who store keyframes of a recording, and makes others wait.
 
-    The same rows that a writer changes first are changed here, to what they are.
+    The same rows that a writer changes first are changed here, to what they are. Raises UsageError, NotFoundError, and
+    DatabaseError where keyframes were stored or deleted after this transaction had begun to read: it would miss them.
     """
     item = ingest_items.c
     held = update(ingest_items).where(item.recording_id == one.recording_id)
@@ -126,6 +128,35 @@ def hold(connection: Connection, one: MovedRecording) -> None:
     running = select(func.count()).where(item.recording_id == one.recording_id, item.state == ItemState.RUNNING.value)
     if connection.execute(running).scalar():
         raise UsageError(f"the recording {row.name!r} is being ingested: run it again when that is done")
+    _say_held(connection, one.recording_id)
+    own = keyframes.c.recording_id == one.recording_id
+    if _now(connection, own) != connection.execute(select(func.count()).where(own)).scalar():
+        raise DatabaseError(_stored_meanwhile(row.name))
+
+
+def _say_held(connection: Connection, recording_id: int) -> None:
+    """Writes the rows anew, as they are, of what a recording has still to store.
+
+    For the same reason as `say_moved`: whoever stores one of them on another node of a cluster, and this, have to write
+    one row. (That a keyframe names its recording, and this changes that, are not at odds for a cluster.)
+    """
+    item = ingest_items.c
+    open_ones = [item.recording_id == recording_id, item.state.not_in((ItemState.DONE.value, ItemState.DELETED.value))]
+    found = select(ingest_items).where(*open_ones).with_for_update()
+    rows = [dict(row) for row in connection.execute(found).mappings()]
+    if rows:
+        connection.execute(delete(ingest_items).where(*open_ones))
+    for some in chunks(rows):
+        connection.execute(insert(ingest_items), some)
+
+
+def _now(connection: Connection, which: ColumnElement[bool]) -> int:
+    """How many keyframes there are, with those that others have committed since this transaction began to read."""
+    return int(connection.execute(update(keyframes).where(which).values(frame_index=keyframes.c.frame_index)).rowcount)
+
+
+def _stored_meanwhile(name: str) -> str:
+    return f"keyframes of {name!r} were stored or deleted meanwhile, nothing is changed: run it again"
 
 
 def _present(connection: Connection, before: Mapping[int, FloatArray]) -> dict[int, Any]:
@@ -176,13 +207,6 @@ def say_moved(connection: Connection, recording_ids: Iterable[int]) -> None:
         connection.execute(insert(pose_sources), {**said, "recording_id": key})
 
 
-def _held(connection: Connection, map_id: int) -> int:
-    """How many keyframes the map has, with those that others have committed since this transaction began to read."""
-    k = keyframes.c
-    there = k.recording_id.in_(select(recordings.c.id).where(recordings.c.map_id == map_id))
-    return int(connection.execute(update(keyframes).where(there).values(frame_index=k.frame_index)).rowcount)
-
-
 def _check_recording(connection: Connection, one: MovedRecording, wanted: Move, rows: Mapping[int, Any]) -> None:
     r, k = recordings.c, keyframes.c
     clash = select(r.id).where(r.map_id == wanted.map_id, r.name == one.name, r.id != one.recording_id)
@@ -193,9 +217,7 @@ def _check_recording(connection: Connection, one: MovedRecording, wanted: Move, 
         )
     stored = set(connection.execute(select(k.id).where(k.recording_id == one.recording_id)).scalars())
     if stored != {key for key, row in rows.items() if row.recording_id == one.recording_id}:
-        raise DatabaseError(
-            f"keyframes of {one.name!r} were stored or deleted meanwhile, nothing is changed: run it again"
-        )
+        raise DatabaseError(_stored_meanwhile(one.name))
 
 
 def _check_links(connection: Connection, wanted: Move) -> None:

@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from sqlalchemy import event, select, text
 
-from semdb.database import items, tables
+from semdb.database import items, schema, tables
 from semdb.database.copying import copy_map
+from semdb.database.engine import make_engine
 from semdb.database.links import list_links, load_covariances
 from semdb.database.moving import move
 from semdb.database.pose_records import (
@@ -254,6 +256,47 @@ def test_what_is_stored_late_goes_along(store: Store) -> None:
     np.testing.assert_allclose(poses_of(store, source, recording_id)[late], pose(112), atol=1e-9)
     last = write(store, recording_id, 20)
     np.testing.assert_allclose(poses_of(store, source, recording_id)[last], pose(120), atol=1e-12)
+
+
+@pytest.mark.parametrize("back", [False, True])
+def test_a_keyframe_that_is_stored_after_a_move_has_begun_to_read(any_server_url: str, back: bool) -> None:
+    """Its transaction does not see it, but the move has to: else it stays where it was in a recording that moved.
+
+    (Writers of SQLite wait for each other.)
+    """
+    engine = make_engine(any_server_url)
+    schema.upgrade(engine)
+    engine.dispose()
+    with open_store(any_server_url) as store, open_store(any_server_url) as other:
+        map_id, _, _ = fill(store)
+        source, recording_id, _ = fill_estimated(store, leave=1)
+        late = replace(record(20, description(320)), world_from_camera=pose(120))
+        if back:
+            move(store.engine, wanted(store, map_id, recording_id, source))
+            [operation] = list_operations(store.engine, map_id)
+            work = partial(undo, store.engine, operation)
+        else:
+            work = partial(move, store.engine, wanted(store, map_id, recording_id, source))
+        stored: list[int] = []
+
+        def store_late(_c: object, _u: object, statement: str, *_: object) -> None:
+            if statement.startswith("UPDATE ingest_items") and not stored:
+                stored.append(0)
+                stored[0] = other.write_keyframe(recording_id, late).keyframe_id
+
+        event.listen(store.engine, "before_cursor_execute", store_late)
+        try:
+            with pytest.raises(DatabaseError, match="stored or deleted meanwhile"):
+                work()
+        finally:
+            event.remove(store.engine, "before_cursor_execute", store_late)
+        expected = MOTION @ pose(120) if back else pose(120)
+        np.testing.assert_allclose(
+            poses_of(store, map_id if back else source, recording_id)[stored[0]], expected, atol=1e-9
+        )
+        if back:
+            work()
+            np.testing.assert_allclose(poses_of(store, source, recording_id)[stored[0]], pose(120), atol=1e-9)
 
 
 def test_a_move_that_cannot_be_changes_nothing(store: Store) -> None:
