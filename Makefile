@@ -16,8 +16,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 LOCK := requirements/constraints.txt
-# two processes: each starts servers of its own
-PYTEST_ARGS ?= --numprocesses 2
+# three processes for two cores, as many tests wait for servers; each process starts servers of its own
+PYTEST_ARGS ?= --numprocesses 3 --dist worksteal
 # byte code is kept: without it each of the tests' many processes would compile semdb anew
 export PYTHONDONTWRITEBYTECODE :=
 

@@ -7,7 +7,7 @@ import pytest
 from bench.rooms import Row, compare, render
 from semdb.recordings.synthetic import SyntheticOptions
 
-ROOMS = 5
+ROOMS = 4
 
 
 @pytest.fixture(scope="module")
@@ -16,7 +16,7 @@ def rows() -> dict[str, Row]:
     return {row.method: row for row in compare(render(options, ROOMS), "exact", ("cnn", "counts", "semdb"))}
 
 
-def test_a_fifth_is_ranked_and_fewer_first_candidates_are_wrong(rows: dict[str, Row]) -> None:
+def test_a_part_is_ranked_and_fewer_first_candidates_are_wrong(rows: dict[str, Row]) -> None:
     semantic, blind = rows["semdb"], rows["cnn"]
     assert (semantic.keyframes, semantic.queries) == (12 * ROOMS, 4 * ROOMS)
     assert blind.ranked == semantic.keyframes

@@ -150,6 +150,7 @@ def check_equal(cluster: clusters.Cluster) -> None:
     assert sums[0] == sums[1] == sums[2]
 
 
+@pytest.mark.long
 def test_a_group_of_mysql_changes_its_primary_and_loses_it(group: clusters.Group, tmp_path: Path) -> None:
     room = small_room(tmp_path)
     first, second, third = group.nodes

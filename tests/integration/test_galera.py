@@ -49,6 +49,7 @@ def galera() -> Iterator[clusters.Galera]:
         yield made
 
 
+@pytest.mark.long
 def test_a_node_is_killed_and_returns(galera: clusters.Galera, tmp_path: Path) -> None:
     room = small_room(tmp_path)
     with open_store(galera.url(0)) as store, ingested(room, tmp_path) as undisturbed:
