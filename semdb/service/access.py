@@ -88,7 +88,7 @@ class GuardedRoute(APIRoute):
             service: Service = request.app.state.service
             with service.forms.room_for(request) as there_is_room:
                 if there_is_room:
-                    read_form(request, await _body(request))
+                    await read_form(request, await _body(request))
                 return await handler(request)
 
         return guarded
