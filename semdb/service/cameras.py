@@ -14,6 +14,7 @@ from typing import Any
 
 from semdb.door.protocol import CameraTracker
 from semdb.service.problems import busy
+from semdb.service.roles import ON_LOOPBACK
 
 MOST_WAITING = 4  # frames of one camera
 MOST_PLACES = 300  # of its path that are kept
@@ -21,8 +22,9 @@ MOST_PLACES = 300  # of its path that are kept
 
 @dataclass(eq=False)
 class Live:
-    """A camera that is tracked, or is about to be."""
+    """A camera that is tracked, or is about to be, for whoever asked."""
 
+    who: str = ""
     tracker: CameraTracker | None = None
     opened: bool = False  # by its first request, not by a frame
     frames: int = 0
@@ -57,22 +59,27 @@ class Live:
 class Sessions:
     """The cameras of this process by the id of their session; used on the loop alone."""
 
-    def __init__(self, most: int, idle_s: float) -> None:
-        self._most, self._idle_s = most, idle_s
+    def __init__(self, most: int, most_each: int, idle_s: float) -> None:
+        self._most, self._most_each, self._idle_s = most, most_each, idle_s
         self._live: dict[str, Live] = {}
 
     def __len__(self) -> int:
         return len(self._live)
 
     @asynccontextmanager
-    async def use(self, name: str) -> AsyncIterator[Live]:
-        """The camera of that session, for one at a time. Raises Problem 429 where no more are taken."""
+    async def use(self, name: str, who: str) -> AsyncIterator[Live]:
+        """The camera of that session, for one at a time. Raises Problem 429 where no more are taken, or of this token.
+
+        Without a token there is nobody else whose places could be taken.
+        """
         live = self._live.get(name)
         if live is None:
             self.forget()
             if len(self._live) >= self._most:
                 raise busy(f"{self._most} cameras are tracked already", self._idle_s / 4)
-            live = self._live[name] = Live()
+            if who != ON_LOOPBACK.who and self.of(who) >= self._most_each:
+                raise busy(f"{self._most_each} cameras of this token are tracked already", self._idle_s / 4)
+            live = self._live[name] = Live(who)
         if live.waiting >= MOST_WAITING:
             raise busy("frames of this session wait already: send the next one when the last one is answered", 1)
         live.waiting += 1
@@ -85,6 +92,10 @@ class Sessions:
             live.used_s = time.monotonic()
             if live.tracker is None and not live.waiting and self._live.get(name) is live:
                 self.end(name)
+
+    def of(self, who: str) -> int:
+        """How many are tracked for a token."""
+        return sum(live.who == who for live in self._live.values())
 
     def watched(self, map_name: str) -> list[dict[str, Any]]:
         """The cameras that move in a map, the one that moved last first."""

@@ -35,7 +35,7 @@ from semdb.service.localize_routes import (
 )
 from semdb.service.middleware import check_depth, close_reason, tell
 from semdb.service.problems import Problem, busy, not_found, problem_of
-from semdb.service.roles import LOCALIZE
+from semdb.service.roles import LOCALIZE, ON_LOOPBACK
 from semdb.service.routing import MapName, Table
 from semdb.service.signing import LONGEST, opened, signed
 from semdb.service.state import Service, access_of, gone, service_of
@@ -82,7 +82,7 @@ async def open_session(
     name = signed(service.secret, KIND, asdict(common), seconds)
     if len(name) > LONGEST:
         raise Problem(422, "what the frames have in common is too long for an address: give categories with each frame")
-    async with service.sessions.use(common.id) as live:
+    async with service.sessions.use(common.id, common.who) as live:
         await service.localizing.run(lambda: open_tracker(service.database, live, common), lambda: gone(request))
         live.opened = True
     address = f"/v1/sessions/{name}"
@@ -129,7 +129,7 @@ async def track_frame(
     )
     service = service_of(request)
     _check(service, frame)
-    async with service.sessions.use(common.id) as live:
+    async with service.sessions.use(common.id, common.who) as live:
         answer = await service.localizing.run(
             lambda: track(service.database, live, common, frame), lambda: gone(request)
         )
@@ -173,15 +173,14 @@ async def stream(socket: WebSocket) -> None:
     request_id = str(socket.scope["state"]["request_id"])
     service: Service = socket.app.state.service
     try:
-        await admit(socket, LOCALIZE)
+        access = await admit(socket, LOCALIZE)
         _common(socket, socket.path_params["session"])
-        if len(service.sockets) >= service.settings.sessions:
-            raise busy("all places for connections are taken", service.settings.session_idle_s / 4)
+        check_places(service, access.who)
     except (Problem, SemdbError) as error:
         problem = error if isinstance(error, Problem) else problem_of(error)
         await tell(socket.scope, socket._send, problem, request_id)
         return
-    service.sockets.add(socket)
+    service.sockets[socket] = access.who
     try:
         await socket.accept()
         await _frames(socket, request_id)
@@ -192,7 +191,16 @@ async def stream(socket: WebSocket) -> None:
     except Problem as problem:
         await socket.close(1008, close_reason(problem))
     finally:
-        service.sockets.discard(socket)
+        del service.sockets[socket]
+
+
+def check_places(service: Service, who: str) -> None:
+    """Raises Problem 429 where there is no place for one more connection, or for one more of this token."""
+    settings = service.settings
+    of_token = sum(one == who for one in service.sockets.values())
+    each = settings.sessions if who == ON_LOOPBACK.who else settings.sessions_per_token
+    if len(service.sockets) >= settings.sessions or of_token >= each:
+        raise busy("all places for connections are taken", settings.session_idle_s / 4)
 
 
 async def _frames(socket: WebSocket, request_id: str) -> None:
@@ -232,7 +240,7 @@ async def _answered(service: Service, common: Common, said: dict[str, Any], file
         odometry=None if odometry is None else pose_of([float(number) for number in odometry]),
     )
     _check(service, frame)
-    async with service.sessions.use(common.id) as live:
+    async with service.sessions.use(common.id, common.who) as live:
         answer = await service.localizing.run(lambda: track(service.database, live, common, frame))
     service.metrics.tracked(answer["state"])
     return dict(answer)

@@ -48,6 +48,7 @@ class ServeSettings(BaseSettings):
     body_timeout_s: float = Field(30.0, gt=0, description="a client that sends or takes nothing for so long is let go")
     request_timeout_s: float = Field(600.0, gt=0, description="the longest that a body may take to come")
     sessions: int = Field(64, ge=1, le=10_000, description="cameras tracked at once by a process; more: 429")
+    sessions_per_token: int = Field(32, ge=1, le=10_000, description="of these for one token; more: 429")
     session_idle_s: float = Field(
         60.0, gt=0, description="a session of which nothing comes for so long lets its camera go"
     )

@@ -60,7 +60,7 @@ class Service:
     drawing: Pool = field(init=False)
     writing: Pool = field(init=False)
     sessions: Sessions = field(init=False)
-    sockets: set[WebSocket] = field(default_factory=set)
+    sockets: dict[WebSocket, str] = field(default_factory=dict)  # and who has them
     rates: Rates = field(init=False)
     secret: bytes = field(init=False, repr=False)
     metrics: Metrics = field(init=False)
@@ -79,7 +79,8 @@ class Service:
         self.rates = Rates(self.settings.rate, self.settings.burst)
         folder = self.settings.uploads or self.database.settings.cache_dir / "serve" / "uploads"
         self.uploads = Uploads(folder.expanduser().absolute(), int(self.settings.max_unpacked_mb * MIB))
-        self.sessions = Sessions(self.settings.sessions, self.settings.session_idle_s)
+        each = self.settings.sessions_per_token
+        self.sessions = Sessions(self.settings.sessions, each, self.settings.session_idle_s)
         self.metrics = Metrics(lambda: self.localizing.inside, lambda: len(self.sessions))
         self.secret = (self.settings.secret or secrets.token_hex(32)).encode()
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import threading
 import time
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -13,11 +14,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from semdb.door.protocol import CameraTracker
 from semdb.errors import DatabaseError, FrameError, ModelError, NotFoundError, UsageError
 from semdb.service import schemas
+from semdb.service.cameras import Sessions
 from semdb.service.middleware import check_depth
 from semdb.service.pool import Pool
 from semdb.service.problems import Problem, problem_of, scrubbed
+from semdb.service.roles import ON_LOOPBACK
+from semdb.service.session_routes import check_places
 from semdb.service.settings import ServeSettings, is_loopback, serve_settings
 from semdb.service.signing import opened, signed
 from semdb.service.values import mask_of, run_lengths
@@ -147,3 +152,49 @@ def test_a_pool_tells_when_to_come_again() -> None:
     asyncio.run(pool.run(lambda: time.sleep(0.01)))
     assert 0.1 < pool._usual_s < 0.3
     pool.close()
+
+
+def test_one_token_leaves_places_for_others() -> None:
+    sessions = Sessions(most=4, most_each=2, idle_s=60)
+
+    async def begin(name: str, who: str) -> None:
+        await begin_in(sessions, name, who)
+
+    async def all_of_it() -> None:
+        for name in ("a", "b", "a"):  # the third one is there already
+            await begin(name, "token 1")
+        with pytest.raises(Problem, match="2 cameras of this token") as refused:
+            await begin("c", "token 1")
+        assert refused.value.status == 429
+        await begin("d", "token 2")
+        await begin("e", ON_LOOPBACK.who)
+        with pytest.raises(Problem, match="4 cameras are tracked"):
+            await begin("f", "token 3")
+        sessions.end("a")
+        await begin("c", "token 1")
+        assert (sessions.of("token 1"), len(sessions)) == (2, 4)
+
+    asyncio.run(all_of_it())
+    alone = Sessions(most=3, most_each=1, idle_s=60)
+    for name in "abc":  # without tokens there is nobody else
+        asyncio.run(begin_in(alone, name, ON_LOOPBACK.who))
+    assert len(alone) == 3
+
+
+async def begin_in(sessions: Sessions, name: str, who: str) -> None:
+    async with sessions.use(name, who) as live:
+        live.tracker = cast(CameraTracker, object())
+
+
+def test_connections_of_one_token_leave_places_for_others() -> None:
+    service: Any = SimpleNamespace(settings=ServeSettings(sessions=3, sessions_per_token=2), sockets={})
+    for number in range(2):
+        check_places(service, "token 1")
+        service.sockets[number] = "token 1"
+    with pytest.raises(Problem) as refused:
+        check_places(service, "token 1")
+    assert refused.value.status == 429
+    check_places(service, "token 2")
+    service.sockets[2] = "token 2"
+    with pytest.raises(Problem):
+        check_places(service, ON_LOOPBACK.who)
