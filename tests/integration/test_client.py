@@ -336,3 +336,9 @@ def test_on_a_server(open_db: Opening, room: Path, frames: list[Frame]) -> None:
         found = db.localize(frames[13], map="office", name="x")
         assert equal(found, database.localize(frames[13], map="office", name="x"))
         assert all(map(equal_keyframes, db.keyframes("office"), database.keyframes("office")))
+        tracks = []
+        for base in (db, database):
+            tracker = base.tracker("office")
+            tracks.append([tracker.update(frame, time_s=0.1 * number) for number, frame in enumerate(frames[12:15])])
+        assert same_tracks(*tracks)
+        assert [str(one.state) for one in tracks[0]][-1] == "tracking"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import socket
@@ -338,6 +339,29 @@ def test_cameras_are_so_many_and_let_go_when_nothing_comes(served: Served, frame
             told = list(pool.map(lambda one: small.client.post(first["frames"], data=one, files=files), sent))
         assert {answer.status_code for answer in told} <= {200, 422, 429}
         assert 429 in {answer.status_code for answer in told}
+
+
+def test_a_session_that_reaches_another_process(served: Served, frames: list[Frame]) -> None:
+    form, files = form_of(frames[6])
+    url, secret = served.database.settings.database_url, "s" * 32
+    with contextlib.ExitStack() as stack:
+        databases = [
+            stack.enter_context(semdb.open(url, cache_dir=served.folder / "cache", threads=1)) for _ in range(3)
+        ]
+        settings = [ServeSettings(secret=secret), ServeSettings(secret=secret), ServeSettings()]
+        one, other, stranger = (stack.enter_context(running(*given)) for given in zip(databases, settings, strict=True))
+        session = one.client.post("/v1/maps/office/sessions", json={}).json()["frames"]
+        found = [
+            service.client.post(session, data=form | {"timestamp_ns": str(10**8 * number)}, files=files)
+            for number, service in enumerate((one, one, other, one))
+        ]
+        assert [answer.status_code for answer in found] == [200] * 4
+        assert [answer.json()["frames"] for answer in found] == [1, 2, 1, 3]
+        assert ["looked for anew" in str(answer.json()["notes"]) for answer in found] == [False, False, True, False]
+        poses = [answer.json()["world_from_camera"] for answer in found]
+        assert poses[2] == poses[0]  # as of a camera that is seen for the first time
+        refused = stranger.client.post(session, data=form, files=files)
+        assert (refused.status_code, "SEMDB_SERVE_SECRET" in refused.json()["detail"]) == (404, True)
 
 
 def test_many_clients_at_once(served: Served, frames: list[Frame]) -> None:

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
+import numpy as np
 import pytest
 from sqlalchemy.engine import make_url
 
@@ -94,6 +95,36 @@ def test_two_processes_share_an_address(file_url: str, tmp_path: Path) -> None:
     told = [line for line in lines if line.get("event") == "request" and line["request_id"] == "mine-7"]
     assert [(line["path"], line["status"], line["who"]) for line in told] == [("/v1/maps", 200, "loopback")]
     assert "Traceback" not in log.read_text()
+
+
+@pytest.mark.long
+def test_cameras_are_tracked_by_two_processes(room: Path, frames: list[Frame], tmp_path: Path) -> None:
+    url, cache = f"sqlite:///{tmp_path / 'a.sqlite3'}", str(tmp_path / "cache")
+    sent = [form_of(frame) for frame in frames[4:16]]
+    with opener(url, Path(cache)) as opening:
+        opening().ingest(room, map="office", stride=4)
+        tracker = opening().tracker("office")
+        wanted = [tracker.update(frame, time_s=frame.timestamp_ns / 1e9) for frame in frames[4:16]]
+    with process(url, tmp_path / "log", "--workers", "2", SEMDB_CACHE_DIR=cache) as (_, address):
+        opened = httpx.post(f"{address}/v1/maps/office/sessions", json={}, timeout=120).json()
+        # a connection that is kept stays with one process, whichever made the session
+        with httpx.Client(base_url=address, timeout=120) as client:
+            kept = [client.post(opened["frames"], data=form, files=files).json() for form, files in sent]
+        assert [one["frames"] for one in kept] == list(range(1, len(sent) + 1))
+        for one, frame in zip(kept, wanted, strict=True):
+            assert frame.world_from_camera is not None
+            assert (one["state"], one["world_from_camera"]) == (str(frame.state), frame.world_from_camera.tolist())
+        # a connection each: whichever process a frame comes to answers, and says where it begins anew
+        session = httpx.post(f"{address}/v1/maps/office/sessions", json={}, timeout=120).json()["frames"]
+        found = [httpx.post(f"{address}{session}", data=form, files=files, timeout=120) for form, files in sent]
+        assert {answer.status_code for answer in found} == {200}
+        anew = [number for number, one in enumerate(found) if "looked for anew" in str(one.json()["notes"])]
+        first = [number for number, one in enumerate(found) if one.json()["frames"] == 1]
+        assert len(anew) <= 1  # the other process begins once, and then goes on
+        assert set(anew) <= set(first)
+        for one, frame in zip(found, frames[4:16], strict=True):
+            assert np.linalg.norm(np.array(one.json()["pose"]["position"]) - frame.world_from_camera[:3, 3]) < 0.05
+    assert "Traceback" not in (tmp_path / "log").read_text()
 
 
 @pytest.mark.long
