@@ -19,6 +19,7 @@ import uvicorn
 from semdb.api import Database
 from semdb.database.engine import parse_url
 from semdb.service.app import make_api, wrapped
+from semdb.service.patient import patient
 from semdb.service.settings import ServeSettings
 from semdb.service.state import Service
 from semdb.types import Frame
@@ -54,7 +55,8 @@ def running(database: Database, settings: ServeSettings) -> Iterator[Served]:
     database._say = database._here.say = _say
     service = Service(database, settings)
     api = make_api(service)
-    config = uvicorn.Config(wrapped(api, service), port=0, log_config=None, access_log=False, lifespan="on")
+    given = {"log_config": None, "access_log": False, "lifespan": "on", "http": patient(settings.body_timeout_s)}
+    config = uvicorn.Config(wrapped(api, service), port=0, **given)
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()

@@ -19,6 +19,7 @@ from semdb.errors import SemdbError, UsageError
 from semdb.events import PlainFormatter, event, log_to
 from semdb.service.app import make_app
 from semdb.service.metrics import MULTIPROCESS
+from semdb.service.patient import PatientProtocol
 from semdb.service.settings import ServeSettings
 from semdb.service.state import Service, note
 from semdb.settings import Settings
@@ -58,6 +59,7 @@ def check(settings: Settings, serve: ServeSettings) -> None:
 def from_environment() -> ASGIApp:
     """What each of several processes runs."""
     settings, serve = Settings(), ServeSettings()
+    PatientProtocol.head_s = serve.body_timeout_s
     _log(settings)
     try:
         return make_app(open_service(settings, serve))
@@ -71,6 +73,7 @@ def serve_forever(settings: Settings, serve: ServeSettings) -> None:
     import uvicorn
 
     check(settings, serve)
+    PatientProtocol.head_s = serve.body_timeout_s
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # what the web server raises again when it has stopped
     options = {
         "host": serve.host,
@@ -86,6 +89,7 @@ def serve_forever(settings: Settings, serve: ServeSettings) -> None:
         "ws_max_queue": 2,  # a client that sends more waits
         "ws_ping_interval": 20.0,
         "h11_max_incomplete_event_size": 64 * 1024,
+        "http": PatientProtocol,
     }
     if serve.workers == 1:
         _log(settings)

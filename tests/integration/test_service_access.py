@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import socket
 import struct
@@ -15,6 +16,8 @@ import pytest
 from click.testing import Result
 from sqlalchemy import text
 from typer.testing import CliRunner
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
 
 import semdb
 from semdb.cli.main import app
@@ -46,11 +49,13 @@ IN_ADDRESS = {
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """A service on a map ``m`` of samples, and an empty one, ``other``."""
-    url = f"sqlite:///{tmp_path_factory.mktemp('access') / 'a.sqlite3'}"
+    folder = tmp_path_factory.mktemp("access")
+    url = f"sqlite:///{folder / 'a.sqlite3'}"
     with open_store(url, create=True) as store:
         fill(store)
         store.ensure_map("other")
-    with running(semdb.open(url, sql_time_limit_s=1.0), SETTINGS) as found:
+    settings = SETTINGS.model_copy(update={"ingest_roots": str(folder / "roots"), "uploads": folder / "uploads"})
+    with running(semdb.open(url, sql_time_limit_s=1.0, cache_dir=folder / "cache"), settings) as found:
         yield found
 
 
@@ -184,40 +189,55 @@ def test_statements_do_not_show_tokens(served: Served, tokens: dict[str, str]) -
         assert "access_tokens" not in client.get("/v1/tables").json()["tables"]
 
 
-@pytest.mark.parametrize(
-    "evil",
-    [
-        "'; DROP TABLE maps; --",
-        '" OR 1=1 --',
-        "%' UNION SELECT hash FROM access_tokens --",
-        "../../etc/passwd",
-        "\x00",
-        "🤖" * 50,
-    ],
-)
-def test_no_parameter_is_a_statement_or_a_path(
-    served: Served, tokens: dict[str, str], names: list[str], evil: str
-) -> None:
-    before = served.database.maps()
+EVIL = ("'; DROP TABLE maps; --", '" OR 1=1 UNION SELECT hash FROM access_tokens --', "../../../etc/passwd", "\x00🤖%")
+
+
+def parameters(served: Served) -> Iterator[tuple[str, str, str, str, dict[str, str]]]:
+    """Method, path, kind and name of every parameter of every route, and the others that the route asks for."""
+    document = served.api.openapi()
+    for path, operations in document["paths"].items():
+        for method, operation in operations.items():
+            listed = operation.get("parameters", [])
+            needed = {
+                one["name"]: str(one["schema"].get("examples", ["1"])[0])
+                for one in listed
+                if one["in"] == "query" and one.get("required")
+            }
+            for one in listed:
+                yield method, path, one["in"], one["name"], needed
+            for kind, content in operation.get("requestBody", {}).get("content", {}).items():
+                schema = content["schema"]
+                schema = document["components"]["schemas"].get(schema.get("$ref", "").rpartition("/")[2], schema)
+                for name in schema.get("properties", {}):
+                    yield method, path, kind, name, needed
+
+
+def test_no_parameter_is_a_statement_or_a_path(served: Served, tokens: dict[str, str], names: list[str]) -> None:
+    before, walked = served.database.maps(), list(parameters(served))
+    assert len(walked) > 150
     with served.with_token(tokens["admin"]) as client:
-        for method, path, _ in routes(served):
-            if method != "GET" or path == "/v1/sql":
+        for number, (method, path, where, name, needed) in enumerate(walked):
+            if (method, path) == ("get", "/v1/sql") and name == "sql":
                 continue
-            spelled = {name: httpx.QueryParams({"x": evil})["x"] for name in ("map", *IN_ADDRESS)}
-            address = path
-            for name, value in spelled.items():
-                address = address.replace(f"{{{name}}}", "".join(f"%{byte:02X}" for byte in value.encode()))
-            asked = dict.fromkeys(
-                ("map", "recording", "what", "near", "after", "before", "x", "category", "kind"), evil
-            )
-            answer = client.get(address, params=asked if "{" not in path else None)
-            assert answer.status_code < 500 or path == "/ready", (address, answer.text)
-            assert "root:" not in answer.text
-            assert "sqlite" not in answer.text.replace("'sqlite", ""), answer.text
-        form = dict.fromkeys(("camera", "like", "name", "categories", "depth_scale"), evil)
-        answer = client.post(f"/v1/maps/{names[0]}/localize", data=form, files={"image": noise()})
-        assert answer.status_code in (422, 503, 409), answer.text
-        assert str(served.folder) not in answer.text
+            for evil in EVIL if where in ("query", "path") else EVIL[number % 2 :: 2]:
+                given: dict[str, Any] = {"params": needed}
+                in_address = {"map": names[0], **IN_ADDRESS}
+                if where == "path":
+                    in_address[name] = "".join(f"%{byte:02X}" for byte in evil.encode())
+                elif where == "query":
+                    given["params"] = needed | {name: evil}
+                elif where == "application/json":
+                    given["json"] = {name: evil}
+                else:
+                    given |= {"data": {name: evil}, "files": {"image": noise(32, 24)}}
+                with client.stream(method, path.format(**in_address), **given) as answer:
+                    if "event-stream" not in answer.headers.get("content-type", ""):
+                        answer.read()
+                        assert "root:" not in answer.text
+                        shown = answer.text.replace("'sqlite", "")
+                        assert "sqlite" not in shown, (path, name, shown)
+                        assert str(served.folder) not in shown, (path, name, shown)
+                assert answer.status_code < 500 or path == "/ready" or "model" in answer.text, (path, name, answer.text)
     assert served.database.maps() == before
 
 
@@ -285,6 +305,25 @@ def test_a_body_that_comes_slowly_is_let_go(served: Served, tokens: dict[str, st
         assert 0.5 < time.monotonic() - started < 8
 
 
+def test_headers_that_come_slowly_are_let_go(served: Served) -> None:
+    host, port = served.url.removeprefix("http://").split(":")
+    whole = f"GET /health HTTP/1.1\r\nHost: {host}\r\n\r\n".encode()
+    starts = (b"", whole[:-4], whole + whole[:-4])  # nothing, a part of the first request, a part of the second one
+    started = time.monotonic()
+    with contextlib.ExitStack() as stack:
+        slow = [stack.enter_context(socket.create_connection((host, int(port)), timeout=20)) for _ in starts]
+        for one, start in zip(slow, starts, strict=True):
+            one.sendall(start)
+        for one in slow:
+            while one.recv(65536):  # the answer to a whole one, then the end
+                pass
+    assert 0.5 < time.monotonic() - started < 15
+    with httpx.Client(base_url=served.url) as client:  # whoever is quick may stay
+        for _ in range(3):
+            assert client.get("/health").status_code == 200
+            time.sleep(0.4)
+
+
 def test_pages_of_other_places_get_nothing(served: Served, tokens: dict[str, str]) -> None:
     with served.with_token(tokens["admin"]) as client:
         for headers in (
@@ -304,6 +343,11 @@ def test_pages_of_other_places_get_nothing(served: Served, tokens: dict[str, str
         assert client.get("/v1/maps", headers=followed).status_code == 200
         answer = client.options("/v1/maps", headers={"Origin": served.url, "Access-Control-Request-Method": "POST"})
         assert "access-control-allow-origin" not in answer.headers
+    address = f"ws{served.url.removeprefix('http')}/v1/sessions/x/stream"
+    for headers in ({"Origin": "https://evil.example"}, {"Sec-Fetch-Site": "cross-site"}):
+        with pytest.raises(InvalidStatus) as refused:
+            connect(address, additional_headers=headers | {"Authorization": f"Bearer {tokens['admin']}"})
+        assert refused.value.response.status_code == 403
     policy = served.client.get("/health").headers["content-security-policy"]
     assert policy.startswith("default-src 'none'")
     assert "http:" not in policy
@@ -347,7 +391,7 @@ def test_commands_make_list_and_revoke(served: Served) -> None:
         seconds_of("soon")
 
 
-def test_a_token_asks_only_so_often(served: Served, tokens: dict[str, str]) -> None:
+def test_a_token_asks_only_so_often(served: Served, tokens: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     from semdb.service.problems import Problem
     from semdb.service.roles import Rates
 
@@ -360,6 +404,11 @@ def test_a_token_asks_only_so_often(served: Served, tokens: dict[str, str]) -> N
     rates.take("b")
     time.sleep(0.15)
     rates.take("a")
+    monkeypatch.setattr(served.service, "rates", Rates(rate=0.01, burst=2))
+    with served.with_token(tokens["read"]) as client, served.with_token(tokens["admin"]) as other:
+        answers = [client.get("/v1/maps") for _ in range(3)]
+        assert [answer.status_code for answer in answers] == [200, 200, 429]
+        assert (answers[2].headers["Retry-After"], other.get("/v1/maps").status_code) == ("100", 200)
 
 
 def test_what_is_deleted_was_confirmed(served: Served, tokens: dict[str, str], names: list[str]) -> None:
