@@ -24,6 +24,10 @@ STATEMENT = (
     "SELECT category, COUNT(*) AS seen, ROUND(AVG(x), 2) AS x, ROUND(AVG(y), 2) AS y, ROUND(AVG(z), 2) AS z\n"
     "FROM keyframe_objects GROUP BY category ORDER BY seen DESC"
 )
+DRAWN = """() => {
+    const space = document.querySelector('.stage, .viewer'), viewer = document.querySelector('.viewer')?.viewer;
+    return !space || (viewer?.cloud && viewer.complete);
+}"""
 WIDE = {"width": 1280, "height": 800}
 
 
@@ -39,9 +43,14 @@ def main(url: str, demo: Path, out: Path) -> None:
         visit.page.set_input_files("input[type=file] >> nth=0", [str(path) for path in photos])
         visit.page.wait_for_selector(f"text={len(photos)} of {len(photos)} localized")
         take("locate", None, "figure.matches path", height=1250)
-        taker(light, out)("queries", "/maps/room/queries", "table.data")
-        taker(light, out)("sql", f"/sql?q={quote_plus(STATEMENT)}", ".sql-out strong")
-        taker(light, out)("ingest", "/maps/room/ingest", "table.data")
+        bright = taker(light, out)
+        bright("queries", "/maps/room/queries", "table.data")
+        light.go(f"/sql?q={quote_plus(STATEMENT)}")
+        light.page.click("text=Show in the map")
+        bright("sql", None, ".in-map .topmap", height=1000)
+        light.go("/maps/room/ingest")
+        light.page.click("button[aria-label='Ingest photos']")  # no recording: what failed is shown
+        bright("ingest", None, ".job .tag.bad")
         live(url, demo, visit)
         take("live", None)
 
@@ -56,14 +65,10 @@ def taker(visit: Visit, out: Path) -> Callable[..., None]:
             visit.go(path)
         if waits is not None:
             page.wait_for_selector(waits)
-        page.wait_for_function(
-            "() => { const shown = document.querySelector('.viewer'); return !shown || shown.viewer?.complete; }"
-        )
+        page.wait_for_function(DRAWN)
         page.wait_for_function("() => [...document.images].every(one => one.complete || one.loading === 'lazy')")
-        page.wait_for_timeout(1500)  # points come a little later, pictures are decoded
-        page.wait_for_function(
-            "() => { const shown = document.querySelector('.viewer'); return !shown || shown.viewer?.complete; }"
-        )
+        page.wait_for_timeout(1000)  # flights end, pictures are decoded
+        page.wait_for_function(DRAWN)
         page.screenshot(path=str(out / f"explorer-{name}.jpg"), type="jpeg", quality=78)
         print(f"{out / f'explorer-{name}.jpg'}")
 
@@ -75,7 +80,7 @@ def live(url: str, demo: Path, visit: Visit) -> None:
     visit.go("/maps/room/live")
     frames = sorted((demo / "room" / "rgb").iterdir())[20:44]
     with httpx.Client(base_url=url, timeout=60) as client:
-        session: Any = client.post("/v1/maps/room/sessions", json={"name": "robot"}).json()
+        session: Any = client.post("/v1/maps/room/sessions", json={}).json()
         for number, frame in enumerate(frames):
             image = cv2.imencode(".png", cv2.imread(str(frame)))[1].tobytes()
             sent = client.post(session["frames"], data={"time_s": number / 30}, files={"image": ("frame.png", image)})

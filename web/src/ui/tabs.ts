@@ -10,7 +10,10 @@ export type MapPage = (typeof PAGES)[number];
 export function mapHead(map: string, current: MapPage): HTMLElement {
   const tab = (address: string, text: string, here: boolean): HTMLElement => {
     const made = a(address, null, text);
-    if (here) made.setAttribute("aria-current", "page");
+    if (here) {
+      made.setAttribute("aria-current", "page");
+      requestAnimationFrame(() => made.scrollIntoView({ inline: "nearest", block: "nearest" })); // on a phone not all have room
+    }
     return made;
   };
   return h(

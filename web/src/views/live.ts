@@ -32,7 +32,12 @@ export function live({ root, until, params }: Context): Updatable {
   const place = h("div");
   root.append(mapHead(map, "live"), place);
   let watching: Watching | null = null;
-  void show(place, until, async () => (watching = new Watching(map, await sceneOfMap(map, until), until)).element);
+  void show(place, until, async () => {
+    const scene = await sceneOfMap(map, until);
+    if (scene.keyframes.length === 0) return empty(texts.map.empty, [texts.map.emptyHint, command(texts.map.emptyCommand(map))]);
+    watching = new Watching(map, scene, until);
+    return watching.element;
+  });
   return {
     update: (next, query) => {
       if (next["map"] !== map) return false;

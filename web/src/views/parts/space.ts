@@ -1,5 +1,5 @@
 // The map in space with cameras that are none of its own: photos, queries, robots. Without WebGL, a plan.
-import { getBytes, part } from "../../api";
+import { getBytes, isAbort, part } from "../../api";
 import { type KeyframeItem, type MapScene, axesOf, pointsOf } from "../../model";
 import { setQuery } from "../../router";
 import type { Extra, Mode, Viewer } from "../../scene/viewer";
@@ -7,7 +7,7 @@ import { texts } from "../../texts";
 import type { Pose, Vector3 } from "../../types";
 import { fill, h } from "../../ui/h";
 import { key } from "../../ui/keys";
-import { button, loading } from "../../ui/parts";
+import { button, loading, toast } from "../../ui/parts";
 import { theme } from "../../ui/theme";
 import { TopMap } from "../../ui/topmap";
 import { kindOf } from "./evidence";
@@ -55,7 +55,10 @@ export class Space {
   }
 
   private async begin(): Promise<void> {
-    const asked = getBytes(`/v1/maps/${part(this.scene.name)}/points?count=${POINTS}`, this.until).catch(() => null);
+    const asked = getBytes(`/v1/maps/${part(this.scene.name)}/points?count=${POINTS}`, this.until).catch((error: unknown) => {
+      if (!isAbort(error)) toast(texts.map.noPoints);
+      return null;
+    });
     try {
       const { Viewer } = await import("../../scene/viewer");
       if (this.until.aborted) return;
