@@ -46,7 +46,7 @@ from semdb.perception.model_choice import specs_for_ingest
 from semdb.perception.protocols import FeatureExtractor
 from semdb.recordings import open_recordings
 from semdb.recordings.base import Recording
-from semdb.recordings.synthetic import SyntheticOptions, write_synthetic_recording
+from semdb.recordings.synthetic import SyntheticOptions, SyntheticSequence, write_synthetic_recording
 from semdb.refinement.run import refine_map
 from semdb.refinement.steps import FOR_LOCALIZATION
 from semdb.settings import Settings
@@ -98,7 +98,7 @@ class Place:
     """A recording that becomes a map and is asked about; `night` is the same walk in other light."""
 
     recording: Recording
-    night: Recording | None = None
+    night: SyntheticSequence | None = None
 
 
 class Remembered:
@@ -150,18 +150,16 @@ def contestants(settings: Settings) -> list[Contestant]:
 
 
 def room(work: Path, number: int) -> Place:
-    """A rendered room and the same by night, in `work`."""
+    """A rendered room, kept in `work`, and the same by night, of which only what is asked is rendered."""
     day = SyntheticOptions(
         frames=ROOM_FRAMES, lap_frames=ROOM_FRAMES, seed=number, room_seed=100 + number,
         furniture_seed=200 + number, noise=True,
     )  # fmt: skip
-    opened = []
-    for name, options in ((f"room{number}", day), (f"room{number}-night", replace(day, lighting=1.0))):
-        if not (work / name).exists():
-            print(f"rendering {name}", file=sys.stderr)
-            write_synthetic_recording(work / name, options)
-        opened.append(open_recordings(work / name)[0])
-    return Place(*opened)
+    name = f"room{number}"
+    if not (work / name).exists():
+        print(f"rendering {name}", file=sys.stderr)
+        write_synthetic_recording(work / name, day)
+    return Place(open_recordings(work / name)[0], SyntheticSequence(replace(day, lighting=1.0)))
 
 
 def seen_as(place: Place, frame: Frame, condition: str, seed: int) -> Frame:
@@ -170,9 +168,8 @@ def seen_as(place: Place, frame: Frame, condition: str, seed: int) -> Frame:
     if condition != "night":
         return replace(frame, image=degraded(frame.image, condition, rng))
     assert place.night is not None
-    entry = next(entry for entry in place.night.entries if entry.index == frame.index)
-    image = place.night.read_image(entry)
-    return replace(frame, image=darkened(Picture(image, frame.camera, None), rng, NIGHT).image)
+    picture = Picture(place.night.render(frame.index).rgb, frame.camera, None)
+    return replace(frame, image=darkened(picture, rng, NIGHT).image)
 
 
 class Measuring:

@@ -6,7 +6,7 @@ and kept in memory. So every map has them that has images and depth.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -16,6 +16,7 @@ from semdb.database.store import Store
 from semdb.geometry import invert_pose, pose_error, transform_points
 from semdb.localization.confidence import Evidence
 from semdb.localization.learned_matching import KeypointMatcher, for_learned, is_learned
+from semdb.localization.likeness import likeness_by_depth, small_inverse_depth
 from semdb.localization.pose import PoseEstimate
 from semdb.localization.pose_options import PoseOptions
 from semdb.localization.shape_cache import ShapeCache
@@ -32,12 +33,14 @@ BATCHES = (3, 7)  # keyframes that are asked, those with most pairs first
 
 @dataclass(frozen=True, slots=True)
 class FallbackOptions:
-    """When both features together are sure. Chosen on the red kitchen with 6 keyframes, two rendered rooms and rooms of
-    the same shapes: there the mean likeness is at most 0.52, of right poses far from keyframes 0.54 and more.
+    """When both features together are sure. Chosen on the red kitchen with 6 keyframes and one rendered room with its
+    copies: there the lesser likeness by depth is at most 0.82 of wrong poses, at least 0.84 of right ones; and judged
+    on other rooms (docs/features.md).
     """
 
-    least_likeness: float = 0.54  # mean of both features' (`Evidence.likeness`)
-    least_confidence: float = 0.6  # of the fallback's pose
+    least_alike: float = 0.83  # of what is about the inliers of each feature (`likeness_by_depth`)
+    least_alike_in_all: float = 0.55  # of all that the query should see, by the mean of both
+    least_confidence: float = 0.5  # of the fallback's pose
     least_own: int = 16  # first inliers of the map's own feature, below which its pose says nothing
     same: Tolerance = field(
         default_factory=lambda: Tolerance(0.15, 5.0)
@@ -82,7 +85,8 @@ def fallback_cache(store: Store, fallback: Fallback, numbers: ClassNumbers) -> S
         stretch = stretch_of(grey)  # as the query is, where it has little contrast
         seen = grey if stretch is None else stretched(grey, stretch)
         keypoints = find_keypoints(fallback.extractor, stored.camera, seen, depth, objects, fallback.dynamic)
-        return make_view(stored.camera, keypoints, categories, numbers, with_points_only=True, grey=grey)
+        view = make_view(stored.camera, keypoints, categories, numbers, with_points_only=True, grey=grey)
+        return replace(view, inverse_depth=small_inverse_depth(stored.camera, depth))
 
     return ShapeCache(store, made, placed_view, CAPACITY)
 
@@ -101,16 +105,51 @@ def asked_first(keyframes: Sequence[KeyframeView], pairs: Sequence[int]) -> list
     return [batch for batch in (ids[:first], ids[first : first + BATCHES[1]]) if batch]
 
 
+@dataclass(frozen=True, slots=True)
+class Alike:
+    """What looks alike in the query and the best keyframe of each feature, by measured depth; shares."""
+
+    about: float  # the inliers of the feature where it is less
+    in_all: float  # mean of both
+
+
+def alike_by_depth(
+    own: tuple[View, KeyframeView, PoseEstimate] | None,
+    other: tuple[View, KeyframeView, PoseEstimate] | None,
+    with_depth: Callable[[Sequence[int]], Sequence[KeyframeView]],
+) -> Alike | None:
+    """Of each feature the query, its best keyframe and its pose; `with_depth` gives keyframes of ids that have it.
+
+    None where one has no pose, or cannot be compared.
+    """
+    if own is None or other is None:
+        return None
+    depths = {keyframe.keyframe_id: keyframe for keyframe in with_depth([own[1].keyframe_id, other[1].keyframe_id])}
+    found = []
+    for query, keyframe, estimate in (own, other):
+        if keyframe.keyframe_id not in depths:
+            return None
+        pairs = estimate.pairs.take(estimate.pairs.slot == int(np.argmax(estimate.per_keyframe)))
+        seen, inliers = query.seen_xy[pairs.query], keyframe.view.seen_xy[pairs.keypoint]
+        pose = estimate.world_from_camera
+        found.append(likeness_by_depth(query, depths[keyframe.keyframe_id], pose, seen, inliers))
+    if found[0] is None or found[1] is None:
+        return None
+    return Alike(min(found[0][0], found[1][0]), (found[0][1] + found[1][1]) / 2)
+
+
 def fallback_numbers(
-    before: PoseEstimate | None, found: PoseEstimate, evidence: Evidence, confidence: float
+    before: PoseEstimate | None, found: PoseEstimate, evidence: Evidence, confidence: float, alike: Alike | None
 ) -> dict[str, float]:
     """What a fallback found, beside the evidence: how sure, of how many keypoints, and how far from the own pose."""
+    by_depth = (float("nan"), float("nan")) if alike is None else (alike.about, alike.in_all)
     metres, degrees = (float("nan"), float("nan"))
     if before is not None:
         metres, degrees = pose_error(before.world_from_camera, found.world_from_camera)
     names = ("inliers", "first_inliers", "agreement", "likeness")
     numbers = {f"fallback_{name}": float(getattr(evidence, name)) for name in names}
-    return {**numbers, "fallback_confidence": confidence, "fallback_metres": metres, "fallback_degrees": degrees}
+    numbers |= {"fallback_confidence": confidence, "fallback_metres": metres, "fallback_degrees": degrees}
+    return numbers | dict(zip(("fallback_alike", "fallback_alike_in_all"), by_depth, strict=True))
 
 
 def weigh_fallback(
@@ -118,6 +157,7 @@ def weigh_fallback(
     evidence: Evidence | None,
     found: PoseEstimate,
     anew: Evidence,
+    alike: Alike | None,
     judgement: Judgement,
     options: FallbackOptions,
     bounds: VerdictOptions,
@@ -127,18 +167,18 @@ def weigh_fallback(
 
     `judgement` is that of the fallback alone, from its evidence `anew`; `before` and `evidence` are of the map's own
     feature. Learned features match what is of one shape whatever its texture, so that they alone take a room of the
-    same shapes for the map's: the own feature has to find the pose too, not surely, and about the pairs of both what
-    is seen has to look alike.
+    same shapes for the map's: the own feature has to find the pose too, not surely, and what either sees about its
+    pairs has to look `alike`, by the depth of keyframes.
     """
-    if before is None or evidence is None or evidence.first_inliers < options.least_own:
+    if before is None or evidence is None or alike is None or evidence.first_inliers < options.least_own:
         return None
     for one in (evidence, anew):  # two places are alike: each feature may take the one for the other
         if one.rival > bounds.rival_share * one.first_of_best:
             return None
     limit = options.same if accept is None else Tolerance(max(options.same.metres, accept.metres), options.same.degrees)
     metres, degrees = pose_error(before.world_from_camera, found.world_from_camera)
-    alike = (evidence.likeness + anew.likeness) / 2
-    sure = judgement.confidence >= options.least_confidence and alike >= options.least_likeness
+    looks_alike = alike.about >= options.least_alike and alike.in_all >= options.least_alike_in_all
+    sure = judgement.confidence >= options.least_confidence and looks_alike
     enough = anew.inliers >= bounds.localized_inliers and anew.spread >= bounds.minimum_spread
     precise = anew.sigma_m <= bounds.maximum_translation_sigma_m and anew.sigma_deg <= bounds.maximum_rotation_sigma_deg
     if not (sure and enough and precise and metres <= limit.metres and degrees <= limit.degrees):

@@ -34,6 +34,11 @@ LEAST_OFFSETS = 5
 LEAST_CONTRAST = 10.0  # variance of a window, in grey values squared: less shows nothing
 ALIKE = 0.9  # correlation
 LEAST_WINDOWS = 40  # fewer say nothing
+ALIKE_BY_DEPTH = 0.7  # correlation, where depth is measured: of what is there nearly all is above, of copies much below
+MOST_STEP = 0.2  # of the inverse depth, within a window
+LEAST_DEPTH_M = 0.05
+LEAST_KNOWN, LEAST_ABOUT = 0.5, 0.1  # shares of a small pixel, and of what is about it, that have depth
+HOLE_BLUR = 2.0
 
 
 def likeness_about(
@@ -48,19 +53,80 @@ def likeness_about(
     if query.grey is None or keyframe.view.grey is None or not len(rows):
         return None
     grid = _grid(keyframe.view.camera)
-    inliers = keyframe.view.seen_xy[keypoints]
-    x, y, known = _places(query.camera, keyframe, world_from_camera, grid)
-    off_x, off_y = _offsets(x, y, grid, inliers, _grid(query.camera).small(query.seen_xy[rows]))
+    inliers, seen = keyframe.view.seen_xy[keypoints], query.seen_xy[rows]
+    inverse = _inverse_depth(keyframe.view, grid)
+    x, y, known = _places(query.camera, keyframe.world_from_camera, world_from_camera, inverse, grid)
+    off_x, off_y = _offsets(x, y, grid, inliers, _grid(query.camera).small(seen))
     x, y = x + off_x, y + off_y
     own, other = _small(keyframe.view.grey, grid.shape), _small(query.grey, _grid(query.camera).shape)
     compared = _whole_windows(known & (x >= 1) & (y >= 1) & (x < other.shape[1] - 2) & (y < other.shape[0] - 2))
     compared &= _near(grid.cells_of(inliers), grid.shape)
-    mean, variance = _moments(own)
-    compared &= variance > LEAST_CONTRAST
-    at = np.flatnonzero(compared)
-    if len(at) < LEAST_WINDOWS:
+    best, _ = _correlations(own, other, x, y, compared)
+    return None if len(best) < LEAST_WINDOWS else float(np.mean(best > ALIKE))
+
+
+def small_inverse_depth(camera: Camera, depth: Float32Array) -> Float32Array:
+    """One over `depth` ``[H, W]`` (m, NaN or 0 where missing) at the pixels ``[h, w]`` of the small image; else NaN.
+
+    Small holes are filled from what is about them.
+    """
+    shape = _grid(camera).shape
+    with np.errstate(divide="ignore", invalid="ignore"):
+        known = np.isfinite(depth) & (depth > LEAST_DEPTH_M)
+        inverse = np.where(known, 1 / depth, 0).astype(np.float32)
+    parts = [
+        cv2.resize(part, shape[::-1], interpolation=cv2.INTER_AREA) for part in (inverse, known.astype(np.float32))
+    ]
+    about = [cv2.GaussianBlur(part, (0, 0), HOLE_BLUR) for part in parts]
+    filled = np.where(about[1] > LEAST_ABOUT, about[0] / np.maximum(about[1], LEAST_ABOUT), np.float32(np.nan))
+    found = np.where(parts[1] > LEAST_KNOWN, parts[0] / np.maximum(parts[1], LEAST_KNOWN), filled)
+    return np.asarray(found, np.float32)
+
+
+def likeness_by_depth(
+    query: View, keyframe: KeyframeView, world_from_camera: FloatArray, seen: Float32Array, inliers: Float32Array
+) -> tuple[float, float] | None:
+    """The shares (0..1) that look alike of what is about inliers, and of all that the query should see.
+
+    As `likeness_about`, with measured depth: `keyframe` has its `inverse_depth`. So that places are known wherever the
+    depth is smooth, windows on edges of depth are left out, and alike is a correlation of 0.7. Inliers are pixels
+    ``seen[n]`` of the query and ``inliers[n]`` of the keyframe. None as there, and where there is no depth.
+    """
+    inverse = keyframe.view.inverse_depth
+    if query.grey is None or keyframe.view.grey is None or inverse is None or not len(seen):
         return None
+    grid = _grid(keyframe.view.camera)
+    x, y, known = _places(query.camera, keyframe.world_from_camera, world_from_camera, inverse, grid)
+    off_x, off_y = _offsets(x, y, grid, inliers, _grid(query.camera).small(seen))
+    x, y = x + off_x, y + off_y
+    own, other = _small(keyframe.view.grey, grid.shape), _small(query.grey, _grid(query.camera).shape)
+    compared = _whole_windows(known & (x >= 1) & (y >= 1) & (x < other.shape[1] - 2) & (y < other.shape[0] - 2))
+    best, at = _correlations(own, other, x, y, compared & _is_smooth(inverse))
+    about = _near(grid.cells_of(inliers), grid.shape).ravel()[at]
+    if np.count_nonzero(about) < LEAST_WINDOWS:
+        return None
+    return float(np.mean(best[about] > ALIKE_BY_DEPTH)), float(np.mean(best > ALIKE_BY_DEPTH))
+
+
+def _is_smooth(inverse: Float32Array) -> BoolArray:
+    """Of which pixels the window lies on no edge of depth."""
+    side, known = np.ones((WINDOW, WINDOW), np.uint8), np.nan_to_num(inverse)
+    step = cv2.dilate(known, side) - cv2.erode(known, side)
+    return np.asarray(step < MOST_STEP * np.maximum(known, LEAST_ABOUT))
+
+
+def _correlations(
+    own: Float32Array, other: Float32Array, x: Float32Array, y: Float32Array, compared: BoolArray
+) -> tuple[Float32Array, IntArray]:
+    """The best correlation ``[n]`` of each window of `own` that is `compared` and shows something, and where it is.
+
+    `x`, `y` ``[h, w]`` are its places in `other`.
+    """
+    mean, variance = _moments(own)
+    at = np.flatnonzero(compared & (variance > LEAST_CONTRAST)).astype(np.int32)
     mean, variance, best = mean.take(at), variance.take(at), np.full(len(at), -1.0, np.float32)
+    if len(at) < LEAST_WINDOWS:
+        return best, at
     for dy in (-REACH, 0.0, REACH):
         for dx in (-REACH, 0.0, REACH):
             seen = np.asarray(
@@ -70,7 +136,7 @@ def likeness_about(
             variances = variance * (its_square - its_mean * its_mean)
             correlation = (product - mean * its_mean) / np.sqrt(np.maximum(variances, 1e-2))
             np.maximum(best, correlation, out=best)
-    return float(np.mean(best > ALIKE))
+    return best, at
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,13 +175,16 @@ def _small(image: ImageArray, shape: tuple[int, int]) -> Float32Array:
 
 
 def _places(
-    camera: Camera, keyframe: KeyframeView, world_from_camera: FloatArray, grid: _Grid
+    camera: Camera, of_keyframe: FloatArray, world_from_camera: FloatArray, inverse: Float32Array, grid: _Grid
 ) -> tuple[Float32Array, Float32Array, BoolArray]:
-    """Where the query's small image shows each pixel of the keyframe's: x, y ``[h, w]``, and whether that is known."""
-    query_from_keyframe = (invert_pose(world_from_camera) @ keyframe.world_from_camera).astype(np.float32)
+    """Where the query's small image shows each pixel of the keyframe's: x, y ``[h, w]``, and whether that is known.
+
+    `inverse` ``[h, w]`` is one over its depth, `of_keyframe` ``[4, 4]`` the keyframe's pose.
+    """
+    query_from_keyframe = (invert_pose(world_from_camera) @ of_keyframe).astype(np.float32)
     # points times their inverse depth: projections are the same
     seen = grid.rays @ query_from_keyframe[:3, :3].T
-    seen += _inverse_depth(keyframe.view, grid).reshape(-1, 1) * query_from_keyframe[:3, 3]
+    seen += inverse.reshape(-1, 1) * query_from_keyframe[:3, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
         pixels = normalized_to_pixels(camera, seen[:, :2] / seen[:, 2:])
     x, y = _grid(camera).small(pixels).astype(np.float32).T.reshape(2, *grid.shape)

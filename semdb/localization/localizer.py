@@ -25,7 +25,14 @@ from semdb.localization.coarse import (
 )
 from semdb.localization.confidence import Evidence
 from semdb.localization.edge_step import EdgeVerdictOptions
-from semdb.localization.fallback import Fallback, FallbackOptions, asked_first, fallback_numbers, weigh_fallback
+from semdb.localization.fallback import (
+    Fallback,
+    FallbackOptions,
+    alike_by_depth,
+    asked_first,
+    fallback_numbers,
+    weigh_fallback,
+)
 from semdb.localization.keyframe_cache import KeyframeCache
 from semdb.localization.landmark_pose import LandmarkPoseOptions
 from semdb.localization.landmark_step import landmark_pose
@@ -40,7 +47,7 @@ from semdb.localization.pose import (
     recorded_covariance,
 )
 from semdb.localization.pose_options import PoseOptions
-from semdb.localization.search import Search, best_pairs, evidence_of, numbers_of
+from semdb.localization.search import Search, best_of, best_pairs, evidence_of, numbers_of
 from semdb.localization.sources import TimedSource
 from semdb.localization.surface_step import SurfaceVerdictOptions
 from semdb.localization.verdict import Judgement, VerdictOptions, convinces, judge
@@ -287,11 +294,20 @@ class Localizer:
         found = self._settle(again) if again.keyframes else settled
         if again.estimate is None or found[2] is None:
             return search, *settled
-        said = fallback_numbers(search.estimate, again.estimate, found[2], found[1].confidence)
+        alike = alike_by_depth(best_of(search), best_of(again), self.cache.fallback_views)
+        said = fallback_numbers(search.estimate, again.estimate, found[2], found[1].confidence, alike)
         search.fallback_numbers = again.fallback_numbers = said
         bounds, (_, _, evidence) = self.options.verdict.accepting(search.accept), settled
         judgement = weigh_fallback(
-            search.estimate, evidence, again.estimate, found[2], found[1], FallbackOptions(), bounds, search.accept
+            search.estimate,
+            evidence,
+            again.estimate,
+            found[2],
+            alike,
+            found[1],
+            FallbackOptions(),
+            bounds,
+            search.accept,
         )
         if judgement is None:
             return search, *settled

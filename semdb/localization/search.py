@@ -15,6 +15,8 @@ from semdb.localization.pose_options import PoseOptions
 from semdb.localization.views import KeyframeView, View
 from semdb.types import ConsistentPose, Float32Array, Tolerance
 
+Best = tuple[View, KeyframeView, PoseEstimate]
+
 
 @dataclass(slots=True)
 class Search:
@@ -54,6 +56,15 @@ def evidence_of(search: Search, estimate: PoseEstimate, rival: int) -> Evidence:
     cosines = {proposal.keyframe_id: proposal.cosine for proposal in search.proposals}
     known = [cosines[keyframe.keyframe_id] for keyframe in search.keyframes]
     return gather_evidence(search.query, search.keyframes, estimate, rival, known)
+
+
+def best_of(search: Search) -> Best | None:
+    """The query, the keyframe that has most inliers, and the pose; None where there is none."""
+    estimate = search.estimate
+    if estimate is None:
+        return None
+    best = max(range(len(estimate.per_keyframe)), key=estimate.per_keyframe.__getitem__)
+    return search.query, search.keyframes[best], estimate
 
 
 def best_pairs(

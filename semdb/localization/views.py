@@ -34,6 +34,7 @@ class View:
     source: IntArray  # [n]
     grey: ImageArray | None = None  # [H, W] the image, where it is at hand
     looser: Float32Array | None = None  # [n] how many times the sensor's noise the depth of `points` has; None: once
+    inverse_depth: Float32Array | None = None  # [h, w] 1/m of the small image of `likeness`, where it is at hand
 
     def __len__(self) -> int:
         return len(self.xy)

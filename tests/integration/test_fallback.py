@@ -15,7 +15,7 @@ from semdb.geometry import pose_error
 from semdb.ingestion.run import IngestOptions, ingest_recordings
 from semdb.localization.coarse import Batch, Proposal, Stage
 from semdb.localization.confidence import Evidence
-from semdb.localization.fallback import Fallback, FallbackOptions, asked_first, weigh_fallback
+from semdb.localization.fallback import Alike, Fallback, FallbackOptions, asked_first, weigh_fallback
 from semdb.localization.images import fallback_of, make_localizer
 from semdb.localization.localizer import Localizer, LocalizerOptions
 from semdb.localization.pose import PoseEstimate
@@ -94,6 +94,8 @@ def test_it_is_asked_only_where_keypoints_do_not_convince(room: Path, url: str) 
     assert found.verdict is Verdict.LOCALIZED
     assert "keypoints of sift agree" in found.reason
     assert found.evidence["fallback_metres"] < 0.05
+    assert found.evidence["fallback_alike"] > 0.9
+    assert found.evidence["fallback_alike_in_all"] > 0.8
     assert found.world_from_camera is not None
     metres, degrees = pose_error(found.world_from_camera, true)
     assert metres < 0.02
@@ -162,26 +164,28 @@ def test_both_features_have_to_be_sure_together(room: Path, url: str) -> None:
         before: PoseEstimate | None = own,
         own_evidence: Evidence | None = evidence,
         anew: Evidence = evidence,
+        alike: Alike | None = Alike(0.9, 0.8),
         said: Judgement = judgement,
         accept: Tolerance | None = None,
     ) -> Judgement | None:
         options, bounds = FallbackOptions(), VerdictOptions()
-        return weigh_fallback(before, own_evidence, own, anew, said, options, bounds, accept)
+        return weigh_fallback(before, own_evidence, own, anew, alike, said, options, bounds, accept)
 
     given = weigh()
     assert given is not None
     assert given.verdict is Verdict.LOCALIZED
-    weak = weigh(said=replace(judgement, confidence=0.65))
+    weak = weigh(said=replace(judgement, confidence=0.55))
     assert weak is not None
     assert weak.confidence == VerdictOptions().localized_confidence
-    assert weigh(said=replace(judgement, confidence=0.5)) is None
+    assert weigh(said=replace(judgement, confidence=0.45)) is None
     assert weigh(before=None) is None
     assert weigh(own_evidence=None) is None
     assert weigh(own_evidence=replace(evidence, first_inliers=15)) is None
     assert weigh(own_evidence=replace(evidence, rival=evidence.first_of_best)) is None
     assert weigh(anew=replace(evidence, rival=evidence.first_of_best)) is None
-    assert weigh(own_evidence=replace(evidence, likeness=0.5), anew=replace(evidence, likeness=0.5)) is None
-    assert weigh(own_evidence=replace(evidence, likeness=0.4), anew=replace(evidence, likeness=0.7)) is not None
+    assert weigh(alike=None) is None
+    assert weigh(alike=Alike(0.8, 0.8)) is None  # shapes agree, what is on them does not
+    assert weigh(alike=Alike(0.9, 0.5)) is None  # a thing is there, the rest is another place
     assert weigh(anew=replace(evidence, sigma_m=0.07)) is None
     assert weigh(anew=replace(evidence, inliers=19)) is None
     assert weigh(before=moved) is None

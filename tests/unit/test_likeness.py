@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from semdb.geometry import pixels_to_normalized
-from semdb.localization.likeness import likeness_about
+from semdb.localization.likeness import likeness_about, likeness_by_depth, small_inverse_depth
 from semdb.localization.views import KeyframeView, View
 from semdb.types import Camera, ImageArray
 
@@ -154,3 +154,42 @@ def test_nothing_is_said_where_nothing_can_be_compared() -> None:
     assert share(wall(), flat) is None
     assert share(wall(), wall(), inliers=slice(0, 0)) is None
     assert share(wall(), wall(), 1000.0) is None  # the pose puts all of it beside the image
+
+
+def depth_share(query: ImageArray, keyframe: ImageArray, inverse: np.ndarray | None, shift_px: float = 0.0) -> object:
+    own = replace(view(keyframe), inverse_depth=inverse)
+    pose = np.eye(4)
+    pose[0, 3] = shift_px * DEPTH_M / CAMERA.fx
+    other = replace(view(query), seen_xy=own.seen_xy - np.float32([shift_px, 0]))
+    placed = KeyframeView(1, own, np.eye(4), np.eye(4), own.points.astype(np.float64))
+    return likeness_by_depth(other, placed, pose, other.seen_xy, own.seen_xy)
+
+
+def test_with_measured_depth_all_that_is_seen_is_compared() -> None:
+    inverse = small_inverse_depth(CAMERA, np.full((240, 320), DEPTH_M, np.float32))
+    assert inverse.shape == (120, 160)
+    moved = np.roll(wall(), -16, axis=1)
+    about, everywhere = depth_share(moved, wall(), inverse, 16.0)  # type: ignore[misc]
+    assert about > 0.95
+    assert everywhere > 0.95
+    about, everywhere = depth_share(wall(1), wall(), inverse)  # type: ignore[misc]
+    assert about < 0.1
+    half = wall()
+    half[150:] = wall(1)[150:]  # below it shows another wall
+    about, everywhere = depth_share(half, wall(), inverse)  # type: ignore[misc]
+    assert 0.45 < everywhere < 0.75
+    assert depth_share(wall(), wall(), None) is None
+
+
+def test_holes_of_depth_are_filled_and_its_edges_left_out() -> None:
+    depth = np.full((240, 320), DEPTH_M, np.float32)
+    depth[100:104, 100:104] = np.nan
+    depth[:, 200:] = np.nan
+    inverse = small_inverse_depth(CAMERA, depth)
+    assert inverse[51, 51] == pytest.approx(0.5)
+    assert np.isnan(inverse[:, 110:]).all()
+    step = np.where(np.arange(320) < 160, 2.0, 4.0).astype(np.float32)[None].repeat(240, axis=0)
+    blurred = wall()
+    blurred[:, 130:190] = wall(1)[:, 130:190]  # about the edge of depth it is something else
+    edge = small_inverse_depth(CAMERA, step)
+    assert depth_share(blurred, wall(), edge)[1] > depth_share(blurred, wall(), inverse * 0 + 0.5)[1]  # type: ignore[index]
