@@ -19,6 +19,7 @@ if TYPE_CHECKING:  # the rooms behind are entered when something is asked of the
     from semdb.door.protocol import Source
     from semdb.evaluation.runner import EvaluateOptions, Outcome
     from semdb.ingestion.queue import Send
+    from semdb.ingestion.redescribe import Redescribed
     from semdb.ingestion.run import IngestOptions, IngestSummary, Progress
     from semdb.localization.query_image import PathText
     from semdb.recordings.arrays import CameraLike
@@ -344,6 +345,18 @@ class Writing(Reading):
             store.engine, store.find_map(map).id, dtype, None if keep_images == ORIGINAL else kept,
             dry_run=dry_run, bad=store.left_out, progress=progress,
         )  # fmt: skip
+
+    def redescribe(self, map: str, *, dry_run: bool = False, progress: Progress | None = None) -> Redescribed:
+        """Describes all keyframes of a map anew, as a new map's are: by the encoder of the settings, or the map's own.
+
+        The map answers from its old vectors until all are there. Cut off anywhere, another call goes on; `dry_run`
+        writes nothing. Raises NotFoundError, UsageError where a keyframe cannot be read or the map is being ingested,
+        RecordingError where images were not kept and the recording is gone, ModelError, DatabaseError.
+        """
+        from semdb.ingestion.redescribe import redescribe_map
+
+        store = self._store()
+        return redescribe_map(store, store.find_map(map), self.settings, dry_run=dry_run, progress=progress)
 
     def evaluate(
         self, paths: Sequence[Path], options: EvaluateOptions | None = None, *, progress: Progress | None = None

@@ -15,6 +15,8 @@ from semdb.cli.options import JsonFlag, Overrides, settings_options
 from semdb.rights import folder_problem
 
 if TYPE_CHECKING:
+    from sqlalchemy import Engine
+
     from semdb.settings import Settings
 
 LIBRARIES = ("numpy", "scipy", "numba", "opencv-contrib-python-headless", "onnxruntime", "poselib", "sqlalchemy")
@@ -130,8 +132,28 @@ def database(settings: Settings) -> Iterator[Check]:
             yield Check("problem", "database", f"{line}: nothing can be ingested or logged")
         schema.check_schema(engine)
         yield Check("ok", "schema", f"revision {schema.HEAD}")
+        yield from crops(engine)
     finally:
         engine.dispose()
+
+
+def crops(engine: Engine) -> Iterator[Check]:
+    """Maps whose keyframes the encoder was shown in another way than those of a new map are."""
+    from semdb.database.lookups import map_heads
+    from semdb.errors import SemdbError
+    from semdb.perception.model_choice import older_crop
+
+    for head in map_heads(engine):
+        try:
+            found = None if head.damage else older_crop(head.models)
+        except SemdbError as error:
+            yield Check("problem", f"map {head.name}", str(error))
+            continue
+        if found is not None:
+            advice = f"semdb ingest --redescribe encoder --map {head.name}"
+            yield Check(
+                "info", f"map {head.name}", f"made with the crop {found[0]}, new maps have {found[1]}: {advice}"
+            )
 
 
 def broker(settings: Settings) -> Iterator[Check]:

@@ -27,8 +27,10 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from semdb.ingestion.queue import Send
+    from semdb.ingestion.redescribe import Redescribed
     from semdb.ingestion.run import IngestSummary
     from semdb.settings import Settings
+    from semdb.types import ModelInfo
 
 
 @settings_options(models=True)
@@ -72,6 +74,13 @@ def command(
     resume: Annotated[
         bool, typer.Option("--resume", help="Send all that is planned and not done to the workers again.")
     ] = False,
+    redescribe: Annotated[
+        str | None,
+        typer.Option(
+            "--redescribe", metavar="WHAT", help="encoder: describe the keyframes of --map, or of all maps, anew."
+        ),
+    ] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="With --redescribe: only say what would be done.")] = False,
     json: JsonFlag = False,
 ) -> None:
     """Select keyframes, describe them and store them. Running it again adds nothing; cut off, it goes on."""
@@ -84,19 +93,27 @@ def command(
     settings = overrides.settings(batch=batch)
     if settings.log_format == "json":
         log_to()
+    chosen = {
+        "PATH": paths,
+        "--map": map_name,
+        "--name": name,
+        "--keyframes": keyframes,
+        "--stride": stride,
+        "--camera": camera,
+        "--align": align or None,
+        "--poses": None if poses == "auto" else poses,
+        **{option_of(name): value for name, value in reading.given().items()},
+    }
+    given = [word for word, value in chosen.items() if value not in (None, [])]
+    if redescribe is not None:
+        others = [word for word in given if word != "--map"] + ["--queue"] * queue + ["--resume"] * resume
+        if others:
+            raise UsageError(f"--redescribe is of a map's stored keyframes and takes no {', '.join(others)}")
+        _redescribe(settings, redescribe, map_name, dry_run=dry_run, json=json)
+        return
+    if dry_run:
+        raise UsageError("--dry-run is for --redescribe; `semdb recording PATH` says what a recording holds")
     if resume:
-        chosen = {
-            "PATH": paths,
-            "--map": map_name,
-            "--name": name,
-            "--keyframes": keyframes,
-            "--stride": stride,
-            "--camera": camera,
-            "--align": align or None,
-            "--poses": None if poses == "auto" else poses,
-            **{option_of(name): value for name, value in reading.given().items()},
-        }
-        given = [word for word, value in chosen.items() if value not in (None, [])]
         if given:
             raise UsageError(
                 f"--resume is of all recordings and takes no {', '.join(given)}: leave that out, or leave out --resume"
@@ -153,6 +170,50 @@ def _resume(settings: Settings, *, json: bool) -> None:
         print_json({"sent": sent})
     else:
         print_lines(f"sent {sent} keyframes to the workers" if sent else "nothing is left to send")
+
+
+def _redescribe(settings: Settings, what: str, map_name: str | None, *, dry_run: bool, json: bool) -> None:
+    """Describes one map anew, or all that hold keyframes, one after the other."""
+    from semdb.cli.output import print_json, print_lines
+    from semdb.cli.progress import StagedProgress
+    from semdb.errors import UsageError
+
+    if what != "encoder":
+        raise UsageError(f"--redescribe {what}: what can be described anew is the encoder's vectors: encoder")
+    done = []
+    with StagedProgress() as progress, ends_when_told(), open_database(settings) as database:
+        names = (
+            [database.map(map_name).name] if map_name is not None else [m.name for m in database.maps() if m.keyframes]
+        )
+        for name in names:
+            done.append(database.redescribe(name, dry_run=dry_run, progress=progress.update))
+    if json:
+        print_json([redescribed_json(one, dry_run=dry_run) for one in done])
+    else:
+        print_lines(*(redescribed_text(one, dry_run=dry_run) for one in done))
+
+
+def redescribed_json(done: Redescribed, *, dry_run: bool) -> dict[str, object]:
+    """What `--redescribe --json` prints for one map."""
+    return {"map": done.map_name, "dry_run": dry_run, **asdict(done), "switched": done.switched and not dry_run}
+
+
+def redescribed_text(done: Redescribed, *, dry_run: bool) -> str:
+    """What `--redescribe` prints for one map."""
+    after = _encoder_text(done.after)
+    if not done.described and not done.switched:
+        return f"{done.map_name}: {done.keyframes} keyframes are described by {after}: nothing to do"
+    verb = "would be described" if dry_run else "described"
+    some = f", {done.recordings} of them from recordings" if done.recordings else ""
+    before = f" in place of {_encoder_text(done.before)}" if done.switched else ""
+    return f"{done.map_name}: {done.described} of {done.keyframes} keyframes {verb} by {after}{before}{some}"
+
+
+def _encoder_text(model: ModelInfo) -> str:
+    from semdb.perception.model_choice import crop_of_model
+
+    crop = crop_of_model(model)
+    return model.name if crop is None else f"{model.name}, crop {crop}"
 
 
 def queued_text(summary: IngestSummary) -> str:

@@ -16,7 +16,15 @@ from semdb.database import checked, retry
 from semdb.database.keyframe_rows import pose_columns, pose_of
 from semdb.database.links import MOST_MATRIX, link_row, matrix_blob, matrix_of
 from semdb.database.pose_records import Link, PlannedPoses, PoseSource, RecordingPoses, World
-from semdb.database.tables import POSE_COLUMNS, maps, planned_links, planned_poses, pose_sources, recordings
+from semdb.database.tables import (
+    POSE_COLUMNS,
+    map_models,
+    maps,
+    planned_links,
+    planned_poses,
+    pose_sources,
+    recordings,
+)
 from semdb.errors import UsageError
 from semdb.types import FloatArray
 
@@ -142,11 +150,15 @@ def load_planned_poses(engine: Engine, recording_id: int) -> dict[int, FloatArra
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Into which map a keyframe goes, and through which motion. `planned` is a covariance as it was estimated."""
+    """Into which map a keyframe goes, and through which motion. `planned` is a covariance as it was estimated.
+
+    `encoder` is the model whose vectors count there, None where the map names none.
+    """
 
     map_id: int
     motion: tuple[float, ...] | None  # of `map_from_recording`; None: it stays as it is
     planned: bytes | None
+    encoder: int | None = None
 
     def moved(self, columns: Mapping[str, Any]) -> dict[str, float]:
         """The columns of a pose that become others."""
@@ -171,8 +183,10 @@ def place_of(connection: Connection, recording_id: int, frame_index: int) -> Pla
     s, p = pose_sources.c, planned_poses.c
     mine = and_(p.recording_id == recordings.c.id, p.frame_index == frame_index)
     covariance = checked.up_to(p.covariance, MOST_MATRIX)
+    m = map_models.c
+    encoder = select(m.model_id).where(m.map_id == recordings.c.map_id, m.role == "encoder").scalar_subquery()
     query = (
-        select(recordings.c.map_id, covariance, *(s[name] for name in POSE_COLUMNS))
+        select(recordings.c.map_id, covariance, *(s[name] for name in POSE_COLUMNS), encoder.label("encoder"))
         .join(pose_sources, s.recording_id == recordings.c.id, isouter=True)
         .join(planned_poses, mine, isouter=True)
         .where(recordings.c.id == recording_id)
@@ -182,7 +196,7 @@ def place_of(connection: Connection, recording_id: int, frame_index: int) -> Pla
         return Place(0, None, None)
     numbers = tuple(getattr(row, name) for name in POSE_COLUMNS)
     still = numbers[0] is None or numbers == (1, 0, 0, 0, 0, 0, 0)
-    return Place(row.map_id, None if still else numbers, row.covariance)
+    return Place(row.map_id, None if still else numbers, row.covariance, row.encoder)
 
 
 def turned(covariance: FloatArray, motion: FloatArray) -> FloatArray:

@@ -7,7 +7,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, Engine, Select, select
+from sqlalchemy import Connection, Engine, Select, func, select
+from sqlalchemy.sql.elements import ColumnElement
 
 from semdb.database import checked, retry
 from semdb.database.codecs import decode_mask, decode_vectors
@@ -22,6 +23,7 @@ from semdb.database.tables import (
     keyframe_images,
     keyframes,
     keypoints,
+    map_models,
     maps,
     object_features,
     objects,
@@ -71,8 +73,25 @@ def check_keyframes(engine: Engine, keys: Sequence[int]) -> None:
     _missing(keys, {key for (key,) in there}, "keyframe")
 
 
+def encoder_id(connection: Connection, map_id: int) -> int | None:
+    """The model whose vectors count in a map; None where none is named, and then all do."""
+    m = map_models.c
+    found = connection.execute(select(m.model_id).where(m.map_id == map_id, m.role == "encoder")).scalar()
+    return None if found is None else int(found)
+
+
+def by_own_encoder() -> ColumnElement[bool]:
+    """Whether a row of `cnn_vectors` is by the encoder of its keyframe's map."""
+    c, m, k = cnn_vectors.c, map_models.c, keyframes.c
+    own = select(m.model_id).join(recordings, recordings.c.map_id == m.map_id)
+    own = own.join(keyframes, k.recording_id == recordings.c.id).where(k.id == c.keyframe_id, m.role == "encoder")
+    return c.model_id == func.coalesce(own.correlate(cnn_vectors).scalar_subquery(), c.model_id)
+
+
 def load_vectors(engine: Engine, keys: Sequence[int]) -> Float32Array:
     """CNN vectors float32 ``[n, d]`` of keyframes in the order of `keys` (``[0, 0]`` for none).
+
+    They are by the encoders of their maps.
 
     Raises NotFoundError for a keyframe that is not there, CodecError for a damaged one.
     """
@@ -81,7 +100,8 @@ def load_vectors(engine: Engine, keys: Sequence[int]) -> Float32Array:
     vector = checked.up_to(c.vector, checked.MOST_VECTOR)
 
     def work(connection: Connection) -> dict[int, bytes]:
-        rows = _chunked(connection, keys, lambda chunk: select(c.keyframe_id, vector).where(c.keyframe_id.in_(chunk)))
+        query = select(c.keyframe_id, vector).where(by_own_encoder())
+        rows = _chunked(connection, keys, lambda chunk: query.where(c.keyframe_id.in_(chunk)))
         return {row.keyframe_id: row.vector for row in rows}
 
     blobs = retry.read(engine, work)

@@ -51,6 +51,16 @@ class MapInfo:
     recordings: int
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageKind:
+    """Where the image of a keyframe is from, and the first bytes of what is stored of it."""
+
+    keyframe_id: int
+    recording_id: int
+    frame_index: int
+    head: bytes
+
+
 @dataclass(frozen=True, slots=True)
 class MapHead:
     """What a program that keeps a map in memory looks at before each query: equal heads, the same models and steps.

@@ -16,7 +16,7 @@ from semdb.class_score import MOST_OBJECTS, Part, word
 from semdb.database import checked, retry
 from semdb.database.codecs import decode_vectors
 from semdb.database.exact_sums import exact_sum, whole
-from semdb.database.reading import Bad, keyframe_ids
+from semdb.database.reading import Bad, by_own_encoder, encoder_id, keyframe_ids
 from semdb.database.tables import categories, cnn_vectors, keyframe_categories, keyframes, maps, recordings
 from semdb.errors import CodecError
 from semdb.types import Float32Array, Int64Array
@@ -34,19 +34,22 @@ def iter_vectors(
     """All vectors of a map: ids int64 ``[n]``, ascending, and float32 ``[n, d]``, `chunk` at a time.
 
     Each chunk is a transaction of its own, so a keyframe that is deleted meanwhile is left out. `size` and `bad` as in
-    `vectors_there`; without `size` it is that of the first chunk.
+    `vectors_there`; without `size` it is that of the first chunk. All are by the encoder that the map has at first.
     """
     ids = np.array(keyframe_ids(engine, map_id), np.int64)
+    encoder = retry.read(engine, lambda connection: encoder_id(connection, map_id))
     for start in range(0, len(ids), chunk):
-        found, vectors = vectors_there(engine, ids[start : start + chunk], size, bad)
+        found, vectors = vectors_there(engine, ids[start : start + chunk], size, bad, encoder)
         size = vectors.shape[1] if len(found) else size
         yield found, vectors
 
 
 def vectors_there(
-    engine: Engine, ids: Int64Array, size: int | None = None, bad: Bad | None = None
+    engine: Engine, ids: Int64Array, size: int | None = None, bad: Bad | None = None, encoder: int | None = None
 ) -> tuple[Int64Array, Float32Array]:
     """Vectors float32 ``[n, d]`` of those of `ids` that are there, and their ids, ascending.
+
+    They are by the model `encoder`, without it by the encoders of their maps.
 
     `size` is how many numbers they have to have, by default as many as most have. A damaged one is zero and told to
     `bad`, or raises CodecError; so is a keyframe that has none, which is left out.
@@ -54,7 +57,7 @@ def vectors_there(
     wanted = np.unique(ids)
 
     def work(connection: Connection) -> tuple[list[tuple[int, bytes]], list[int]]:
-        rows = _rows(connection, wanted)
+        rows = _rows(connection, wanted, encoder)
         return rows, _without_row(connection, wanted, rows)
 
     rows, without = retry.read(engine, work)
@@ -95,7 +98,7 @@ def coarse_rows(
             for part, number in zip(Part, map(_held, numbers), strict=True)
             if number
         ]
-        rows = _rows(connection, wanted)
+        rows = _rows(connection, wanted, encoder_id(connection, map_id))
         return rows, _without_row(connection, wanted, rows), shown
 
     rows, without, shown = retry.read(engine, work)
@@ -222,11 +225,12 @@ def _decoded(rows: list[tuple[int, bytes]], size: int | None, bad: Bad | None) -
     return found, decode_vectors([row[1] for row in rows], found, size, bad)
 
 
-def _rows(connection: Connection, ids: Int64Array) -> list[tuple[int, bytes]]:
+def _rows(connection: Connection, ids: Int64Array, encoder: int | None) -> list[tuple[int, bytes]]:
     if not len(ids):
         return []
     c = cnn_vectors.c
     query = select(c.keyframe_id, checked.up_to(c.vector, checked.MOST_VECTOR))
+    query = query.where(by_own_encoder() if encoder is None else c.model_id == encoder)
     first, last = int(ids[0]), int(ids[-1])
     if len(ids) >= DENSE * (last - first + 1):
         keys = set(ids.tolist())

@@ -219,11 +219,15 @@ class Store:
         """CNN vectors float32 ``[n, d]`` in the order of `keyframe_ids`. Raises NotFoundError, CodecError."""
         return reading.load_vectors(self.engine, keyframe_ids)
 
+    def encoder_id(self, map_id: int) -> int | None:
+        """The model whose vectors count in a map; None where it names none."""
+        return retry.read(self.engine, lambda connection: reading.encoder_id(connection, map_id))
+
     def vectors_there(
-        self, keyframe_ids: Int64Array, size: int | None = None, bad: Bad | None = None
+        self, keyframe_ids: Int64Array, size: int | None = None, bad: Bad | None = None, encoder: int | None = None
     ) -> tuple[Int64Array, Float32Array]:
         """CNN vectors ``[n, d]`` of those keyframes that are there, and their ids: see `scanning.vectors_there`."""
-        return scanning.vectors_there(self.engine, keyframe_ids, size, bad)
+        return scanning.vectors_there(self.engine, keyframe_ids, size, bad, encoder)
 
     def load_keyframes(
         self, keyframe_ids: Sequence[int], *, descriptors: bool = True, bad: Bad | None = None

@@ -48,7 +48,7 @@ _OBJECT_IDS = select(tables.objects.c.ordinal, tables.objects.c.id).where(
 
 
 class _MovedError(Exception):
-    """The recording is in another map than it was when its keyframe was made ready."""
+    """The recording is in another map, or its map has another encoder, than when its keyframe was made ready."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +107,7 @@ class KeyframeWriter:
                 work = partial(_write, target=target, recording_id=recording_id, rows=rows, claimed=claimed)
                 return retry.write(self._engine, work)
             except _MovedError:
-                self.forget()  # the recording is in another map by now
+                self.forget()  # the recording is in another map, or described by another encoder, by now
             except IntegrityError as error:
                 # Another writer stored the same keyframe, or a row that was remembered has been deleted.
                 failure = error
@@ -284,7 +284,7 @@ def _write(
             return WriteResult(int(keyframe_id), created=mine)
         _refuse(connection, recording_id, frame_index)
     place = place_of(connection, recording_id, frame_index)
-    if place.map_id != target.map_id:
+    if place.map_id != target.map_id or place.encoder not in (None, rows.vector["model_id"]):
         raise _MovedError
     keyframe = {**rows.keyframe, "recording_id": recording_id, **place.moved(rows.keyframe)}
     keyframe_id = new_id(connection, tables.keyframes, keyframe)

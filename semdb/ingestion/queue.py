@@ -14,14 +14,12 @@ from dataclasses import dataclass, field
 from semdb.database import items
 from semdb.database.items import OpenItem, open_items
 from semdb.database.planning import StoredPlan, check_models, stored_plan
-from semdb.database.pose_records import PoseSource
-from semdb.database.pose_sources import load_planned_poses, recording_poses
 from semdb.database.records import RowOptions
 from semdb.database.requeue import requeue_failed
 from semdb.database.store import Store, open_store
-from semdb.errors import ModelError, NotFoundError, RecordingError, RecordingUnavailableError, UsageError
-from semdb.ingestion.estimation import posed, with_poses
-from semdb.ingestion.plan import fingerprint
+from semdb.errors import ModelError, NotFoundError, UsageError
+from semdb.ingestion.estimation import posed
+from semdb.ingestion.planned import open_planned
 from semdb.ingestion.run import (
     IngestOptions,
     IngestSummary,
@@ -37,7 +35,6 @@ from semdb.ingestion.work import Item, work_off
 from semdb.perception.describe import Describer
 from semdb.perception.model_choice import ModelSpecs, settings_of_map, specs_for_ingest
 from semdb.recordings.base import Recording
-from semdb.recordings.source import locate, open_located, parse_source
 from semdb.settings import Settings
 
 CHUNK = 16  # keyframes of one message
@@ -229,26 +226,12 @@ class Workplace:
         if self._opened is not None and self._opened[0] == key and self._opened[1].path.exists():
             return self._opened[1]
         self._opened = None
-        found = parse_source(plan.source)
-        folder = locate(found.address, self._settings)
-        if not folder.exists():
-            raise RecordingUnavailableError(
-                f"{folder}: no such folder or file on this machine; workers must see recordings under the path "
-                "or URL that was given to `semdb ingest --queue`"
-            )
-        opened = open_located(folder, self._settings, found.parsed_camera, found.options)
-        if len(opened) != 1:
-            raise RecordingError(f"{folder}: on this machine there are {len(opened)} recordings, and one was planned")
-        recording = opened[0]
-        if recording_poses(store.engine, plan.recording_id).source is PoseSource.ESTIMATED:
-            recording = with_poses(recording, load_planned_poses(store.engine, plan.recording_id))
-        known = {entry.index: entry for entry in recording.entries}
-        entries = [known[index] for index in plan.frame_indexes if index in known]
-        if len(entries) == len(plan.frame_indexes) and fingerprint(recording, entries) != plan.fingerprint:
-            raise RecordingError(
-                f"{folder}: on this machine it is another recording than the one that was planned: its camera, or "
-                "times or poses of keyframes differ"
-            )
+        recording = open_planned(
+            store,
+            plan,
+            self._settings,
+            "workers must see recordings under the path or URL that was given to `semdb ingest --queue`",
+        )
         self._opened = (key, recording)
         return recording
 

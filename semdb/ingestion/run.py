@@ -168,7 +168,7 @@ def describers_for(
     map_models = map_models_of(store, map_name)
     specs = specs_for_ingest(settings, map_models, has_masks=has_masks)
     own = settings_of_map(settings, map_models)
-    key = (specs, own.score_threshold, own.max_keypoints, own.classes, own.dynamic)
+    key = (specs, own.encoder_crop, own.score_threshold, own.max_keypoints, own.classes, own.dynamic)
     if key not in known:
         known[key] = make_describers(specs, own)
     return specs, known[key]

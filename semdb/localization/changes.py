@@ -6,6 +6,7 @@ from collections.abc import Collection, Sequence
 
 from semdb.database.records import Change, ChangeKind, ChangeMark
 from semdb.database.store import Store
+from semdb.errors import ProvenanceError
 from semdb.localization.coarse import MapChange
 
 # Change ids commit out of order: how far behind the newest one a late one may still turn up.
@@ -59,6 +60,30 @@ class ChangeReader:
         since = self._since()
         self.seen = frozenset(number for number in ids if number > since)
         self._mark = ChangeMark(max(self.seen, default=0), len(self.seen), sum(self.seen))
+
+
+class SameEncoder:
+    """Whether a map is still asked by the vectors of the encoder that it had when this was made."""
+
+    def __init__(self, store: Store, map_id: int) -> None:
+        self._store = store
+        self._map_id = map_id
+        self.model_id = store.encoder_id(map_id)
+        self._known = False
+
+    def check(self, changed: bool) -> None:
+        """Looks at first, where the map has `changed`, and after an error.
+
+        Raises ProvenanceError where it is not: vectors of queries are compared with those of their own encoder.
+        """
+        if self._known and not changed:
+            return
+        self._known = self._store.encoder_id(self._map_id) == self.model_id
+        if not self._known:
+            raise ProvenanceError(
+                f"map {self._map_id} was described anew by another encoder since it was opened: ask again, and it is "
+                "opened as it is now"
+            )
 
 
 def summary_of(changes: Sequence[Change] | None) -> MapChange:

@@ -141,7 +141,7 @@ class OpenMaps:
     def _describer(self, head: MapHead) -> Describer:
         specs = specs_for_query(self._settings, head.models)
         own = settings_of_map(self._settings, head.models)
-        key = (specs, own.score_threshold, own.max_keypoints, own.classes, own.dynamic)
+        key = (specs, own.encoder_crop, own.score_threshold, own.max_keypoints, own.classes, own.dynamic)
         if key not in self._describers:
             self._describers[key] = describer_from_specs(specs.detector, specs.encoder, specs.features, own)
         check_models(head.models, self._describers[key].models, f"the map {head.name!r}")

@@ -9,7 +9,7 @@ import numpy as np
 
 from semdb.class_score import ClassQuery
 from semdb.database.store import Store
-from semdb.localization.changes import ChangeReader, summary_of
+from semdb.localization.changes import ChangeReader, SameEncoder, summary_of
 from semdb.localization.coarse import CoarseSource, MapChange, Ranked, Scored
 from semdb.localization.ranking import best_first, exact_cosines
 from semdb.types import Float32Array, FloatArray, Int64Array
@@ -22,6 +22,7 @@ class SqlSource:
         self._store = store
         self._map_id = map_id
         self._changes = ChangeReader(store, map_id)
+        self._encoder = SameEncoder(store, map_id)
         self._count: int | None = None
         self._frequencies: dict[str, int] = {}
 
@@ -29,9 +30,11 @@ class SqlSource:
         """Nothing is kept here but numbers of keyframes, of all and by class; what others keep may be out of date."""
         if self._count is None:
             self._changes.skip()
+            self._encoder.check(changed=True)
             self._count = self._store.keyframe_count(self._map_id)
             return MapChange()
         change = summary_of(self._changes.read())
+        self._encoder.check(bool(change))
         if change:
             self._count = self._store.keyframe_count(self._map_id)
             self._frequencies = {}
@@ -56,7 +59,9 @@ class SqlSource:
         return Scored(ids, np.array([keyframe.class_score for keyframe in found], np.float64))
 
     def cosines(self, vector: Float32Array, keyframe_ids: Int64Array) -> FloatArray:
-        ids, vectors = self._store.vectors_there(keyframe_ids, len(vector), self._store.left_out)
+        ids, vectors = self._store.vectors_there(
+            keyframe_ids, len(vector), self._store.left_out, self._encoder.model_id
+        )
         result = np.full(len(keyframe_ids), np.nan)
         if len(ids):
             place = np.minimum(np.searchsorted(ids, keyframe_ids), len(ids) - 1)

@@ -9,6 +9,7 @@ from typing import Any
 
 from semdb.errors import ModelError, UsageError
 from semdb.perception.catalogue import BY_NAME
+from semdb.perception.encoders.crops import CROPS, DEFAULT, crop_of
 from semdb.perception.model_files import models_dir, resolve_file, resolve_onnx
 from semdb.perception.torch_models import resolve_checkpoint
 from semdb.settings import Settings
@@ -95,11 +96,34 @@ def settings_of_map(settings: Settings, map_models: Sequence[ModelInfo]) -> Sett
         for name in ("score_threshold", "max_keypoints"):
             if name in config and name not in settings.model_fields_set:
                 taken[name] = config[name]
+        if model.role == "encoder" and settings.encoder_crop == AUTO:
+            taken["encoder_crop"] = crop_of(config) or AUTO
         if model.role == "detector":
             for name in ("classes", "dynamic"):
                 if name in config and name not in settings.model_fields_set:
                     taken[name] = ",".join(config[name])
     return settings.model_copy(update=taken)
+
+
+def spec_for_redescription(settings: Settings, stored: ModelInfo) -> tuple[str, Settings]:
+    """The encoder that describes a map anew, whose vectors are by `stored`, and the settings that it is loaded with.
+
+    It is the one that settings name, else the map's own, shown what a new map's is. Raises UsageError where its file
+    is not at hand.
+    """
+    spec = _spec_of(stored, settings) if settings.encoder == AUTO else settings.encoder
+    return spec, settings
+
+
+def crop_of_model(encoder: ModelInfo) -> str | None:
+    """The crop that vectors were made with; None for an encoder that has none. Raises ModelError."""
+    return crop_of(_config(encoder))
+
+
+def older_crop(models: Sequence[ModelInfo]) -> tuple[str, str] | None:
+    """The crop that a map's vectors were made with and the one of new maps, where they differ. Raises ModelError."""
+    crops = [crop_of_model(model) for model in models if model.role == "encoder"]
+    return (crops[0], DEFAULT) if crops and crops[0] not in (None, DEFAULT) else None
 
 
 def dynamic_classes(map_models: Sequence[ModelInfo]) -> frozenset[str]:
@@ -138,6 +162,7 @@ _RIGHT: dict[str, Callable[[object], bool]] = {
     "max_keypoints": lambda value: isinstance(value, int) and _is_number(value, 1, 20_000),
     "classes": _are_names,
     "dynamic": _are_names,
+    "view": lambda value: value in CROPS,
 }
 
 

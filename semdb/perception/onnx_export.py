@@ -15,7 +15,7 @@ from typing import Any
 from semdb.errors import ModelError, UsageError
 from semdb.perception.catalogue import BY_NAME
 from semdb.perception.detectors.torchvision import known_architecture, load_detector_checkpoint
-from semdb.perception.encoders.onnx import CROP
+from semdb.perception.encoders.crops import SIDE as CROP
 from semdb.perception.encoders.torchvision import expected_outputs, load_encoder_checkpoint
 from semdb.perception.model_files import file_sha256, first_line, onnx_sha256
 from semdb.perception.torch_models import import_torch, resolve_checkpoint

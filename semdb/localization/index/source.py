@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 
 from semdb.class_score import ClassQuery
+from semdb.localization.changes import SameEncoder
 from semdb.localization.coarse import MapChange, Ranked, Scored
 from semdb.localization.index.map_index import MapIndex
 from semdb.types import Float32Array, FloatArray, Int64Array
@@ -15,14 +16,16 @@ class IndexSource:
 
     def __init__(self, index: MapIndex) -> None:
         self._index = index
+        self._encoder = SameEncoder(index.store, index.map_id)
         self._version, self._state = index.current
 
     def refresh(self) -> MapChange:
         self._index.refresh()
-        before = self._version
-        if self._index.current[0] == before:
+        before, current = self._version, self._index.current
+        self._encoder.check(current[0] != before)
+        if current[0] == before:
             return MapChange()
-        self._version, self._state = self._index.current
+        self._version, self._state = current
         return self._index.changes_between(before, self._version)
 
     def keyframe_count(self) -> int:

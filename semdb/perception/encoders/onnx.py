@@ -6,26 +6,24 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from semdb.errors import ModelError
+from semdb.perception.encoders.crops import config_of, crop_named, squares
 from semdb.perception.model_files import GPU_BATCH, OnnxModel, canonical_json, resolve_onnx
 from semdb.settings import Settings
 from semdb.types import Float32Array, ImageArray, ModelInfo
 
-SHORT_SIDE = 256
-CROP = 224
-
 
 class OnnxEncoder:
-    """A network ``[B, 3, 224, 224]`` RGB 0..1 to ``embedding`` ``[B, d]``, on the centre of the image."""
+    """A network ``[B, 3, 224, 224]`` RGB 0..1 to ``embedding`` ``[B, d]``, on one square of the image or several."""
 
     def __init__(self, spec: str, settings: Settings) -> None:
         path = resolve_onnx(spec, settings)
         self._model = OnnxModel(path, settings.threads, ("embedding",), settings.device)
-        config = canonical_json({"crop": CROP, "short_side": SHORT_SIDE})
+        self._crop = crop_named(settings.encoder_crop)
+        config = canonical_json(config_of(self._crop))
         self.best_batch = GPU_BATCH if self._model.on_gpu and self._model.takes_batches else 1
         self.info = ModelInfo("encoder", f"onnx:{path.name}", self._model.sha256, config)
 
@@ -47,11 +45,18 @@ class OnnxEncoder:
         return np.concatenate([self._run([image]) for image in images])
 
     def _run(self, images: Sequence[ImageArray]) -> Float32Array:
-        (embedding,) = self._model.run(np.concatenate([centre_batch(image) for image in images]))
-        if embedding.ndim != 2 or embedding.shape[0] != len(images):
-            count, wanted = "one image" if len(images) == 1 else f"{len(images)} images", f"[{len(images)}, d]"
+        shown = np.concatenate([squares(image, self._crop) for image in images])
+        at_once = self._model.takes_batches or len(shown) == 1
+        embedding = self._embedded(shown) if at_once else np.concatenate([self._embedded(one[None]) for one in shown])
+        return pooled(embedding, len(images), self._model.path)
+
+    def _embedded(self, shown: Float32Array) -> npt.NDArray[np.floating[Any]]:
+        (embedding,) = self._model.run(shown)
+        if embedding.ndim != 2 or embedding.shape[0] != len(shown):
+            count, wanted = "one image" if len(shown) == 1 else f"{len(shown)} images", f"[{len(shown)}, d]"
             raise ModelError(f"{self._model.path}: embedding is {embedding.shape} for {count}; wanted is {wanted}")
-        return np.stack([unit_vector(row, self._model.path) for row in embedding])
+        found: npt.NDArray[np.floating[Any]] = embedding
+        return found
 
 
 def unit_vector(embedding: npt.NDArray[np.floating[Any]], path: Path) -> Float32Array:
@@ -64,11 +69,12 @@ def unit_vector(embedding: npt.NDArray[np.floating[Any]], path: Path) -> Float32
     return unit
 
 
-def centre_batch(image: ImageArray) -> Float32Array:
-    """The centre of an RGB `image` as float32 ``[1, 3, 224, 224]``, its short side first resized to 256 pixels."""
-    ratio = SHORT_SIDE / min(image.shape[:2])
-    width, height = (max(SHORT_SIDE, round(n * ratio)) for n in (image.shape[1], image.shape[0]))
-    resized = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    y, x = height // 2 - CROP // 2, width // 2 - CROP // 2
-    crop = resized[y : y + CROP, x : x + CROP].transpose(2, 0, 1)[None]
-    return np.ascontiguousarray(crop, dtype=np.float32) / np.float32(255)
+def pooled(rows: npt.NDArray[np.floating[Any]], images: int, path: Path) -> Float32Array:
+    """The vectors ``[images, d]`` of embeddings ``[images * n, d]`` of n squares of each image: means of unit vectors.
+
+    Raises ModelError naming `path` as `unit_vector` does.
+    """
+    units = np.stack([unit_vector(row, path) for row in rows])
+    if len(units) == images:
+        return units
+    return np.stack([unit_vector(mean, path) for mean in units.reshape(images, -1, units.shape[1]).mean(axis=1)])

@@ -11,7 +11,8 @@ import numpy as np
 
 from semdb.errors import ModelError
 from semdb.perception.catalogue import BY_NAME
-from semdb.perception.encoders.onnx import CROP, SHORT_SIDE, centre_batch, unit_vector
+from semdb.perception.encoders.crops import config_of, crop_named, squares
+from semdb.perception.encoders.onnx import pooled
 from semdb.perception.model_files import canonical_json, file_sha256, first_line
 from semdb.perception.torch_models import (
     best_batch,
@@ -38,7 +39,7 @@ _LAYERS: dict[tuple[str, tuple[int, ...]], str] = {
 
 
 class TorchvisionEncoder:
-    """A ResNet up to its average pool (2048-d for ResNet-50) on the centre of the image, in torch."""
+    """A ResNet up to its average pool (2048-d for ResNet-50) on a square of the image or several, in torch."""
 
     def __init__(self, spec: str, settings: Settings) -> None:
         self._torch = import_torch()
@@ -49,7 +50,8 @@ class TorchvisionEncoder:
         self._device = next(self._network.parameters()).device
         self.best_batch = best_batch(self._device)
         self._path = path
-        config = canonical_json({"crop": CROP, "layer": "avgpool", "short_side": SHORT_SIDE})
+        self._crop = crop_named(settings.encoder_crop)
+        config = canonical_json({**config_of(self._crop), "layer": "avgpool"})
         shown = name if name in BY_NAME else path.name
         self.info = ModelInfo("encoder", f"torchvision:{shown}", file_sha256(path), config)
 
@@ -64,7 +66,8 @@ class TorchvisionEncoder:
     def encode_batch(self, images: Sequence[ImageArray]) -> Float32Array:
         """The vectors of `images` (of any sizes) float32 ``[n, d]``; each as `encode` gives it, within rounding."""
         torch = self._torch
-        batch = to_device(np.concatenate([centre_batch(image) for image in images]), self._device, torch)
+        shown = np.concatenate([squares(image, self._crop) for image in images])
+        batch = to_device(shown, self._device, torch)
         try:
             with torch.inference_mode(), layer_precision(self._device, torch):
                 found = self._network(batch).float().cpu().numpy()
@@ -72,7 +75,7 @@ class TorchvisionEncoder:
             raise ModelError(
                 f"{self._path} failed on {len(images)} images on {self._device}: {first_line(error)}"
             ) from error
-        return np.stack([unit_vector(row, self._path) for row in found])
+        return pooled(found, len(images), self._path)
 
 
 def expected_outputs(spec: str) -> int | None:
