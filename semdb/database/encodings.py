@@ -80,10 +80,11 @@ def _rows(connection: Connection, query: Select[Any]) -> list[Any]:
     return list(connection.execute(query))
 
 
-def add_vectors(engine: Engine, model_id: int, vectors: Mapping[int, Float32Array]) -> None:
-    """Writes vectors ``[d]`` of keyframes by a model, those that are not there yet; keyframes that are gone go without.
+def add_vectors(engine: Engine, map_id: int, model_id: int, vectors: Mapping[int, Float32Array]) -> None:
+    """Writes vectors ``[d]`` of a map's keyframes by a model, those that are not there yet, in one transaction.
 
-    One transaction. Raises UnstorableError for one that the server does not take.
+    Keyframes that are gone go without. Where the model is the map's own, the log of changes has them: they had none.
+    Raises UnstorableError for one that the server does not take.
     """
 
     def work(connection: Connection) -> None:
@@ -95,6 +96,9 @@ def add_vectors(engine: Engine, model_id: int, vectors: Mapping[int, Float32Arra
             blob = encode_array(vectors[key].astype("<f4", copy=False))
             check_packet(connection, _STATEMENT + len(blob), f"the cnn_vectors row of keyframe {key}")
             connection.execute(insert(cnn_vectors), {"keyframe_id": key, "model_id": model_id, "vector": blob})
+        if there and encoder_id(connection, map_id) == model_id:
+            change = {"map_id": map_id, "kind": ChangeKind.REDESCRIBED.value}
+            connection.execute(insert(keyframe_changes), [{**change, "keyframe_id": key} for key in sorted(there)])
 
     for _ in range(10):  # another process may do the same, or delete a keyframe, at the same time
         try:

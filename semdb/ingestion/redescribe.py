@@ -107,7 +107,7 @@ def redescribe_map(
     drop_vectors(engine, info.id, [key for key in (known, current) if key is not None])
     total, failed = 0, dict[int, str]()
     for _ in range(ROUNDS):
-        total += _describe(store, sources, encoder, known, failed, progress, info.name)
+        total += _describe(store, sources, encoder, (info.id, known), failed, progress, info.name)
         if failed:
             raise UsageError(_failed_text(info.name, failed))
         if not switch_encoder(engine, info.id, known):
@@ -132,16 +132,19 @@ def _describe(
     store: Store,
     sources: _Sources,
     encoder: Encoder,
-    model_id: int,
+    target: tuple[int, int],
     failed: dict[int, str],
     progress: Progress | None,
     name: str,
 ) -> int:
-    """Writes the vectors of all of `sources`; `failed` is told of those that cannot be read. Returns how many."""
+    """Writes the vectors of all of `sources`, of a map by a model; `failed` is told of those that cannot be read.
+
+    Returns how many were written.
+    """
     stages = (
         Stage("read", lambda some: _read(sources, some, failed)),
         Stage("encode", lambda some: _encode(encoder, some)),
-        Stage("store", lambda some: _store(store, model_id, some)),
+        Stage("store", lambda some: _store(store, target, some)),
     )
     groups = _groups(sources.kinds)
     done = written = 0
@@ -185,9 +188,9 @@ def _encode(encoder: Encoder, some: _Some) -> _Some:
     return some
 
 
-def _store(store: Store, model_id: int, some: _Some) -> _Some:
+def _store(store: Store, target: tuple[int, int], some: _Some) -> _Some:
     if some.vectors:
-        add_vectors(store.engine, model_id, some.vectors)
+        add_vectors(store.engine, *target, some.vectors)
     return some
 
 

@@ -159,7 +159,7 @@ def killed_and_resumed(store: Store, monkeypatch: pytest.MonkeyPatch, point: str
             patched.setattr(redescribe, "switch_encoder", killed)
         elif point == "in the switch":
             patched.setattr(encodings, "insert", killed)
-            patched.setattr(redescribe, "add_vectors", lambda engine, model, found: _insert(real, found, engine, model))
+            patched.setattr(redescribe, "add_vectors", lambda *arguments: _insert(real, *arguments))
         else:
             clear = redescribe.drop_vectors
             patched.setattr(redescribe, "drop_vectors", lambda *a, **k: killed() if len(a) > 3 else clear(*a, **k))
@@ -176,13 +176,13 @@ def killed_and_resumed(store: Store, monkeypatch: pytest.MonkeyPatch, point: str
     assert sum(c.kind is ChangeKind.REDESCRIBED for c in store.changes_since(info.id, 0)) == 10
 
 
-def _insert(real: Any, found: Any, engine: Any, model: int) -> None:
+def _insert(real: Any, *arguments: Any) -> None:
     """`add_vectors` while `insert` is the one that kills the switch."""
     from sqlalchemy import insert as sql_insert
 
     kept, encodings.insert = encodings.insert, sql_insert
     try:
-        real(engine, model, found)
+        real(*arguments)
     finally:
         encodings.insert = kept
 
@@ -191,12 +191,32 @@ def test_what_was_begun_for_another_encoder_is_dropped(store: Store, monkeypatch
     info = filled(store)
     other = encodings.encoder_of(store.engine, dataclasses.replace(GIST, config='{"version":0}'), make=True)
     ids = store.keyframe_ids(info.id)
-    encodings.add_vectors(store.engine, int(other or 0), {key: np.ones(3, np.float32) for key in [*ids[:7], 10**12]})
+    encodings.add_vectors(
+        store.engine, info.id, int(other or 0), {key: np.ones(3, np.float32) for key in [*ids[:7], 10**12]}
+    )
     assert rows(store) == 17
     assert vectors(store, info).shape == (10, 128)
     redescribe_map(store, info, WANTED)
     assert rows(store) == 10
     np.testing.assert_array_equal(vectors(store, info), expected())
+
+
+def test_a_keyframe_without_a_vector_gets_one(store: Store) -> None:
+    """As one that was stored in the moment of a switch; mirrors hear of it."""
+    info = filled(store)
+    redescribe_map(store, info, WANTED)
+    key = store.keyframe_ids(info.id)[2]
+    gone = tables.cnn_vectors.delete().where(tables.cnn_vectors.c.keyframe_id == key)
+    retry.write(store.engine, lambda connection: connection.execute(gone))
+    index = MapIndex.open(store, info.id)
+    before = store.changes_since(info.id, 0)[-1].id
+    done = redescribe_map(store, info, WANTED)
+    assert (done.described, done.switched) == (1, False)
+    told = [change.keyframe_id for change in store.changes_since(info.id, before)]
+    assert told == [key]
+    np.testing.assert_array_equal(vectors(store, info), expected())
+    index.refresh()
+    assert index.state.living == 10
 
 
 def test_keyframes_that_come_meanwhile_are_described_too(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
