@@ -76,7 +76,7 @@ class Settings(BaseSettings):
     encoder: str = Field(
         "auto", description="auto, onnx:FILE, torchvision:NAME or gist. auto: a query takes the map's own"
     )
-    encoder_crop: Literal["auto", "centre", "height", "squashed", "squares"] = Field(
+    encoder_crop: Literal["auto", "centre", "height", "squashed", "padded"] = Field(
         "auto", description="what of an image a place network is shown. auto: a query as the map's keyframes were"
     )
     features: str = Field("auto", description="auto, surf, sift, orb or onnx:FILE. auto: the map's own, or surf")

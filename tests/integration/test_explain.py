@@ -138,6 +138,7 @@ def _values(store: Store, map_ids: list[int]) -> dict[str, Any]:
         "minimum_share": 0.5,
         "change_id": 500,
         "vector": np.ones(128, np.float32),
+        "encoder": store.encoder_id(map_ids[0]),
         "image": "query.png",
         "localization": lost,
         "worker": "a worker",

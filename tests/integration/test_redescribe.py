@@ -119,7 +119,8 @@ def test_new_vectors_take_the_place_of_old_ones_at_once(store: Store) -> None:
     assert len(store.changes_since(info.id, 0)) == 20
 
 
-def test_an_index_on_disk_follows(store: Store, tmp_path: Path) -> None:
+def test_an_index_on_disk_follows(open_file_store: Store, tmp_path: Path) -> None:
+    store = open_file_store
     info = filled(store)
     MapIndex.open(store, info.id, tmp_path).close()
     redescribe_map(store, info, WANTED)
@@ -187,7 +188,8 @@ def _insert(real: Any, *arguments: Any) -> None:
         encodings.insert = kept
 
 
-def test_what_was_begun_for_another_encoder_is_dropped(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_was_begun_for_another_encoder_is_dropped(open_file_store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = open_file_store
     info = filled(store)
     other = encodings.encoder_of(store.engine, dataclasses.replace(GIST, config='{"version":0}'), make=True)
     ids = store.keyframe_ids(info.id)
@@ -201,8 +203,9 @@ def test_what_was_begun_for_another_encoder_is_dropped(store: Store, monkeypatch
     np.testing.assert_array_equal(vectors(store, info), expected())
 
 
-def test_a_keyframe_without_a_vector_gets_one(store: Store) -> None:
+def test_a_keyframe_without_a_vector_gets_one(open_file_store: Store) -> None:
     """As one that was stored in the moment of a switch; mirrors hear of it."""
+    store = open_file_store
     info = filled(store)
     redescribe_map(store, info, WANTED)
     key = store.keyframe_ids(info.id)[2]
@@ -219,7 +222,10 @@ def test_a_keyframe_without_a_vector_gets_one(store: Store) -> None:
     assert index.state.living == 10
 
 
-def test_keyframes_that_come_meanwhile_are_described_too(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_keyframes_that_come_meanwhile_are_described_too(
+    open_file_store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = open_file_store
     info = filled(store)
     recording = store.find_recording(info.id, "visit")
     real, late = redescribe.switch_encoder, [frame(90)]
@@ -234,7 +240,8 @@ def test_keyframes_that_come_meanwhile_are_described_too(store: Store, monkeypat
     assert vectors(store, info).shape == (11, 560)
 
 
-def test_who_stores_by_the_old_encoder_is_refused_after_it(store: Store) -> None:
+def test_who_stores_by_the_old_encoder_is_refused_after_it(open_file_store: Store) -> None:
+    store = open_file_store
     info = filled(store)
     recording = store.find_recording(info.id, "visit")
     with open_store(store.engine.url.render_as_string(hide_password=False)) as other:
@@ -260,7 +267,8 @@ def test_a_map_that_is_being_ingested_keeps_its_vectors(store: Store) -> None:
     assert redescribe_map(store, info, WANTED).described == 0  # all of it was done
 
 
-def test_an_image_that_cannot_be_read_keeps_the_map_as_it_is(store: Store) -> None:
+def test_an_image_that_cannot_be_read_keeps_the_map_as_it_is(open_file_store: Store) -> None:
+    store = open_file_store
     info = filled(store)
     before, ids = vectors(store, info), store.keyframe_ids(info.id)
     i = tables.keyframe_images.c

@@ -11,7 +11,7 @@ import pytest
 
 from semdb.errors import ModelError, UsageError
 from semdb.perception.encoders import load_encoder
-from semdb.perception.encoders.crops import CROPS, DEFAULT, config_of, crop_of, squares
+from semdb.perception.encoders.crops import CROPS, DEFAULT, config_of, crop_of, square
 from semdb.perception.model_choice import crop_of_model, older_crop, settings_of_map, spec_for_redescription
 from semdb.settings import Settings, settings_with
 from semdb.types import ImageArray, ModelInfo
@@ -27,10 +27,10 @@ def halves(height: int, width: int) -> ImageArray:
 
 
 @pytest.mark.parametrize("size", [(480, 640), (640, 480), (240, 320), (100, 99), (3, 500)])
-@pytest.mark.parametrize(("crop", "count"), [("centre", 1), ("height", 1), ("squashed", 1), ("squares", 2)])
-def test_each_crop_is_squares_of_224(size: tuple[int, int], crop: str, count: int) -> None:
-    found = squares(halves(*size), crop)
-    assert found.shape == (count, 3, 224, 224)
+@pytest.mark.parametrize("crop", CROPS)
+def test_each_crop_is_a_square_of_224(size: tuple[int, int], crop: str) -> None:
+    found = square(halves(*size), crop)
+    assert found.shape == (1, 3, 224, 224)
     assert found.dtype == np.float32
     assert found.flags.c_contiguous
     assert 0 <= found.min() <= found.max() <= 200 / 255 + 1e-6
@@ -40,15 +40,14 @@ def test_what_each_crop_shows() -> None:
     image = halves(480, 640)
 
     def shares(crop: str) -> list[float]:
-        return [float(x) for x in (squares(image, crop) > 0.4).mean(axis=(0, 2, 3))]
+        return [float(x) for x in (square(image, crop) > 0.4).mean(axis=(0, 2, 3))]
 
     assert shares("centre") == pytest.approx([0.43, 0.14, 0.43], abs=0.01)  # cuts most of the green away
     for crop in ("height", "squashed"):
         assert shares(crop) == pytest.approx([0.375, 0.25, 0.375], abs=0.01)
-    first, last = squares(image, "squares")
-    assert (first[0] > 0.4).mean() == pytest.approx(0.5, abs=0.01)  # 149 of 224 columns
-    assert (last[2] > 0.4).mean() == pytest.approx(0.5, abs=0.01)
-    np.testing.assert_array_equal(squares(image, "height"), squares(image, "height"))
+    padded = square(image, "padded")[0]
+    np.testing.assert_array_equal(padded[:, :28], np.float32(124) / np.float32(255))  # 56 rows are beside the image
+    assert (padded[:, 28:-28] > 0.5).mean(axis=(1, 2)) == pytest.approx([0.375, 0.25, 0.375], abs=0.01)
 
 
 def test_the_oldest_crop_is_what_it_was() -> None:
@@ -56,19 +55,8 @@ def test_the_oldest_crop_is_what_it_was() -> None:
     image = np.random.default_rng(0).integers(0, 256, (480, 640, 3), dtype=np.uint8)
     resized = cv2.resize(image, (341, 256), interpolation=cv2.INTER_AREA)
     expected = resized[16:240, 58:282].transpose(2, 0, 1)[None].astype(np.float32) / np.float32(255)
-    np.testing.assert_array_equal(squares(image, "centre"), expected)
+    np.testing.assert_array_equal(square(image, "centre"), expected)
     assert json.dumps(config_of("centre"), sort_keys=True) == '{"crop": 224, "short_side": 256}'
-
-
-def test_vectors_of_several_squares_are_the_mean(tmp_path: Path) -> None:
-    spec = f"onnx:{write_mean_embedding_model(tmp_path / 'mean.onnx')}"
-    image = np.zeros((224, 448, 3), np.uint8)
-    image[:, :224, 0], image[:, 224:, 1] = 30, 200  # each counts alike, dark or bright
-    encoder = load_encoder(spec, Settings(threads=1, encoder_crop="squares"))
-    np.testing.assert_allclose(encoder.encode(image), [np.sqrt(0.5), np.sqrt(0.5), 0], atol=1e-5)
-    both = encoder.encode_batch([image, image[:, ::-1].copy()])  # type: ignore[attr-defined]
-    np.testing.assert_array_equal(both[0], encoder.encode(image))
-    assert both.shape == (2, 3)
 
 
 def test_the_crop_is_part_of_the_provenance(tmp_path: Path) -> None:
@@ -80,8 +68,8 @@ def test_the_crop_is_part_of_the_provenance(tmp_path: Path) -> None:
         assert crop_of_model(info) == crop
         assert crop_of(json.loads(info.config)) == crop
         assert settings_of_map(Settings(), [info]).encoder_crop == crop
-        own = Settings(encoder_crop="squares")
-        assert settings_of_map(own, [info]).encoder_crop == "squares"  # and comparing the models says so
+        own = Settings(encoder_crop="padded")
+        assert settings_of_map(own, [info]).encoder_crop == "padded"  # and comparing the models says so
         assert older_crop([info]) == (None if crop == DEFAULT else (crop, DEFAULT))
         assert spec_for_redescription(Settings(encoder=spec), info)[1].encoder_crop == "auto"
     gist = load_encoder("gist", Settings()).info

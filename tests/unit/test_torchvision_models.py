@@ -23,7 +23,7 @@ from semdb.perception.describe import View, describer_from_specs
 from semdb.perception.detectors import load_detector
 from semdb.perception.detectors import torchvision as detectors
 from semdb.perception.encoders import load_encoder
-from semdb.perception.encoders.crops import squares
+from semdb.perception.encoders.crops import square
 from semdb.perception.mask_rcnn import Architecture, build, modern_names
 from semdb.settings import Settings
 from semdb.types import Camera
@@ -290,7 +290,7 @@ def test_places365_features_are_those_before_the_last_layer(python2: bool, tmp_p
     network.avgpool.register_forward_hook(lambda module, inputs, output: found.update(x=output.flatten(1)))
     for image, vector in zip(images, batch, strict=True):
         with torch.inference_mode():
-            network(torch.from_numpy(((squares(image, "centre")[0] - mean) / deviation)[None]).float())
+            network(torch.from_numpy(((square(image, "centre")[0] - mean) / deviation)[None]).float())
         expected = found["x"][0].numpy()
         np.testing.assert_allclose(vector, expected / np.linalg.norm(expected), atol=1e-4)
         np.testing.assert_allclose(encoder.encode(image), vector, atol=1e-4)

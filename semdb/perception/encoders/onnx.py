@@ -10,14 +10,14 @@ import numpy as np
 import numpy.typing as npt
 
 from semdb.errors import ModelError
-from semdb.perception.encoders.crops import config_of, crop_named, squares
+from semdb.perception.encoders.crops import config_of, crop_named, square
 from semdb.perception.model_files import GPU_BATCH, OnnxModel, canonical_json, resolve_onnx
 from semdb.settings import Settings
 from semdb.types import Float32Array, ImageArray, ModelInfo
 
 
 class OnnxEncoder:
-    """A network ``[B, 3, 224, 224]`` RGB 0..1 to ``embedding`` ``[B, d]``, on one square of the image or several."""
+    """A network ``[B, 3, 224, 224]`` RGB 0..1 to ``embedding`` ``[B, d]``, on a square of the image."""
 
     def __init__(self, spec: str, settings: Settings) -> None:
         path = resolve_onnx(spec, settings)
@@ -45,18 +45,11 @@ class OnnxEncoder:
         return np.concatenate([self._run([image]) for image in images])
 
     def _run(self, images: Sequence[ImageArray]) -> Float32Array:
-        shown = np.concatenate([squares(image, self._crop) for image in images])
-        at_once = self._model.takes_batches or len(shown) == 1
-        embedding = self._embedded(shown) if at_once else np.concatenate([self._embedded(one[None]) for one in shown])
-        return pooled(embedding, len(images), self._model.path)
-
-    def _embedded(self, shown: Float32Array) -> npt.NDArray[np.floating[Any]]:
-        (embedding,) = self._model.run(shown)
-        if embedding.ndim != 2 or embedding.shape[0] != len(shown):
-            count, wanted = "one image" if len(shown) == 1 else f"{len(shown)} images", f"[{len(shown)}, d]"
+        (embedding,) = self._model.run(np.concatenate([square(image, self._crop) for image in images]))
+        if embedding.ndim != 2 or embedding.shape[0] != len(images):
+            count, wanted = "one image" if len(images) == 1 else f"{len(images)} images", f"[{len(images)}, d]"
             raise ModelError(f"{self._model.path}: embedding is {embedding.shape} for {count}; wanted is {wanted}")
-        found: npt.NDArray[np.floating[Any]] = embedding
-        return found
+        return np.stack([unit_vector(row, self._model.path) for row in embedding])
 
 
 def unit_vector(embedding: npt.NDArray[np.floating[Any]], path: Path) -> Float32Array:
@@ -67,14 +60,3 @@ def unit_vector(embedding: npt.NDArray[np.floating[Any]], path: Path) -> Float32
         raise ModelError(f"{path} gave an embedding that is zero or not finite: the file is damaged")
     unit: Float32Array = (vector / norm).astype(np.float32)
     return unit
-
-
-def pooled(rows: npt.NDArray[np.floating[Any]], images: int, path: Path) -> Float32Array:
-    """The vectors ``[images, d]`` of embeddings ``[images * n, d]`` of n squares of each image: means of unit vectors.
-
-    Raises ModelError naming `path` as `unit_vector` does.
-    """
-    units = np.stack([unit_vector(row, path) for row in rows])
-    if len(units) == images:
-        return units
-    return np.stack([unit_vector(mean, path) for mean in units.reshape(images, -1, units.shape[1]).mean(axis=1)])

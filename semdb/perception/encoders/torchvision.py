@@ -11,8 +11,8 @@ import numpy as np
 
 from semdb.errors import ModelError
 from semdb.perception.catalogue import BY_NAME
-from semdb.perception.encoders.crops import config_of, crop_named, squares
-from semdb.perception.encoders.onnx import pooled
+from semdb.perception.encoders.crops import config_of, crop_named, square
+from semdb.perception.encoders.onnx import unit_vector
 from semdb.perception.model_files import canonical_json, file_sha256, first_line
 from semdb.perception.torch_models import (
     best_batch,
@@ -39,7 +39,7 @@ _LAYERS: dict[tuple[str, tuple[int, ...]], str] = {
 
 
 class TorchvisionEncoder:
-    """A ResNet up to its average pool (2048-d for ResNet-50) on a square of the image or several, in torch."""
+    """A ResNet up to its average pool (2048-d for ResNet-50) on a square of the image, in torch."""
 
     def __init__(self, spec: str, settings: Settings) -> None:
         self._torch = import_torch()
@@ -66,7 +66,7 @@ class TorchvisionEncoder:
     def encode_batch(self, images: Sequence[ImageArray]) -> Float32Array:
         """The vectors of `images` (of any sizes) float32 ``[n, d]``; each as `encode` gives it, within rounding."""
         torch = self._torch
-        shown = np.concatenate([squares(image, self._crop) for image in images])
+        shown = np.concatenate([square(image, self._crop) for image in images])
         batch = to_device(shown, self._device, torch)
         try:
             with torch.inference_mode(), layer_precision(self._device, torch):
@@ -75,7 +75,7 @@ class TorchvisionEncoder:
             raise ModelError(
                 f"{self._path} failed on {len(images)} images on {self._device}: {first_line(error)}"
             ) from error
-        return pooled(found, len(images), self._path)
+        return np.stack([unit_vector(row, self._path) for row in found])
 
 
 def expected_outputs(spec: str) -> int | None:
