@@ -78,7 +78,10 @@ class SameEncoder:
         """
         if self._known and not changed:
             return
-        self._known = self._store.encoder_id(self._map_id) == self.model_id
+        found = self._store.encoder_id(self._map_id)
+        if self.model_id is None:
+            self.model_id = found  # it was empty
+        self._known = found == self.model_id
         if not self._known:
             raise ProvenanceError(
                 f"map {self._map_id} was described anew by another encoder since it was opened: ask again, and it is "
