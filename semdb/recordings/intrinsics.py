@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
@@ -91,6 +92,7 @@ def depth_scale_problem(scale: float) -> str | None:
     return None
 
 
+@lru_cache(maxsize=64)  # asked of every image, and cameras are few
 def distortion_effect(camera: Camera) -> tuple[float, float]:
     """The share of the image that the distortion does not reach, or reaches twice (there it folds the image over); and
     the greatest ratio, either way, of distances from the centre with and without it.
