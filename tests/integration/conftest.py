@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from semdb.database.engine import make_engine
 from semdb.database.store import Store, open_store
 from semdb.recordings import open_recording
 from semdb.types import Frame
-from tests.integration.opened import Opening, opener
+from tests.integration.opened import STRIDE, Opening, opener
 from tests.unit.onnx_files import write_constant_model, write_mean_embedding_model
 
 
@@ -44,6 +45,27 @@ def open_file(tmp_path: Path) -> Iterator[Opening]:
     """On SQLite alone: for what is not the database's."""
     with opener(f"sqlite:///{tmp_path / 'semdb.sqlite3'}", tmp_path / "cache") as opening:
         yield opening
+
+
+@pytest.fixture(scope="session")
+def office(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a SQLite file, ``a.sqlite3``, on the map ``office`` of six keyframes, to be copied."""
+    folder = tmp_path_factory.mktemp("office")
+    with opener(f"sqlite:///{folder / 'a.sqlite3'}", folder / "cache") as opening:
+        opening().ingest(room, map="office", stride=STRIDE)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def offices(office: Path, room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same with a second map, ``a/b``, of networks that are in its cache folder."""
+    folder = tmp_path_factory.mktemp("offices")
+    shutil.copytree(office, folder, dirs_exist_ok=True)
+    models = folder / "cache" / "models"
+    models.mkdir(parents=True, exist_ok=True)
+    with opener(f"sqlite:///{folder / 'a.sqlite3'}", folder / "cache") as opening:
+        opening(**constant_networks(models)).ingest(room, map="a/b", name="stairs", stride=12)
+    return folder
 
 
 @pytest.fixture(scope="module")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import shutil
 import socket
 import time
 from collections.abc import Iterator
@@ -26,21 +27,16 @@ from semdb.jsonable import to_jsonable
 from semdb.service import values
 from semdb.service.settings import ServeSettings
 from semdb.types import Frame
-from tests.integration.conftest import constant_networks
-from tests.integration.opened import STRIDE, opener
+from tests.integration.opened import opener
 from tests.serving import Served, form_of, png, running
 
 
 @pytest.fixture(scope="module")
-def served(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    """A service of this process on a map of six keyframes, with landmarks."""
+def served(offices: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """A service of this process on two maps: one of masks that come with images, one of networks."""
     folder = tmp_path_factory.mktemp("served")
+    shutil.copytree(offices, folder, dirs_exist_ok=True)
     with opener(f"sqlite:///{folder / 'a.sqlite3'}", folder / "cache") as opening:
-        database = opening()
-        database.ingest(room, map="office", stride=STRIDE)
-        models = folder / "cache" / "models"
-        models.mkdir(parents=True)
-        opening(**constant_networks(models)).ingest(room, map="a/b", name="stairs", stride=12)
         auto = dict.fromkeys(("detector", "encoder", "features"), "auto")  # each map's own
         with running(opening(sql_time_limit_s=2.0, **auto), ServeSettings()) as found:
             yield found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import shutil
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -24,17 +25,17 @@ from semdb.errors import NotFoundError, UsageError
 from semdb.pictures.cloud import STEPS
 from semdb.service.settings import ServeSettings
 from tests.database_samples import fill, stored_landmarks
-from tests.integration.opened import STRIDE, opener
+from tests.integration.opened import opener
 from tests.serving import Served, running
 
 
 @pytest.fixture(scope="module")
-def served(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+def served(office: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """A map of six keyframes with landmarks, and an empty one."""
     folder = tmp_path_factory.mktemp("scene")
+    shutil.copytree(office, folder, dirs_exist_ok=True)
     with opener(f"sqlite:///{folder / 'a.sqlite3'}", folder / "cache") as opening:
         database = opening(detector="auto", encoder="auto", features="auto")
-        database.ingest(room, map="office", stride=STRIDE)
         database.refine("office", steps=["landmarks"])
         database._store().ensure_map("empty")
         with running(database, ServeSettings()) as found:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -17,19 +18,19 @@ import pytest
 from semdb.service.settings import ServeSettings
 from semdb.types import Frame
 from tests.conftest import REPOSITORY
-from tests.integration.opened import STRIDE, opener
+from tests.integration.opened import opener
 from tests.serving import Served, form_of, running
 
 
 @pytest.fixture(scope="module")
-def served(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+def served(office: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """A map of six keyframes with landmarks, and a folder to ingest from."""
     folder = tmp_path_factory.mktemp("views")
+    shutil.copytree(office, folder, dirs_exist_ok=True)
     (folder / "roots" / "empty folder").mkdir(parents=True)
     (folder / "roots" / "notes.txt").write_text("no recording")
     with opener(f"sqlite:///{folder / 'a.sqlite3'}", folder / "cache") as opening:
         database = opening(detector="auto", encoder="auto", features="auto")
-        database.ingest(room, map="office", stride=STRIDE)
         with running(database, ServeSettings(ingest_roots=str(folder / "roots"))) as found:
             yield found
 
