@@ -182,6 +182,9 @@ function guessedUp(keyframes: readonly KeyframeItem[]): Vector3 {
   return Math.hypot(...sum) > 0.3 * keyframes.length && keyframes.length > 0 ? unit(sum) : [0, 0, 1];
 }
 
+/** So many points of a map are asked for. */
+export const MOST_POINTS = 100_000;
+
 export interface PointCloud {
   count: number;
   keyframes: number;

@@ -51,6 +51,7 @@ def test_a_keyframe_shows_what_is_seen_in_it(visit: Visit, world: World) -> None
     seen = page.locator(".detail section, .detail .row-list").first
     expect(seen.locator("li")).to_have_count(len(keyframe.objects))
     page.get_by_label("Keypoints").check()
+    assert "marks=keypoints%2Cobjects" in page.url
     expect(page.locator(".detail")).to_contain_text(f"{len(keyframe.keypoints.features):,} keypoints")
     expect(page.locator(".thumbs li")).to_have_count(min(len(world.database.keyframes(HOSTILE)) - 1, 6))
     drawn(page)

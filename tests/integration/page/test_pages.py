@@ -133,6 +133,8 @@ def test_statements_are_asked_with_the_schema_at_hand(visit: Visit, tmp_path: Pa
     assert "q=SELECT" in page.url
     page.click("text=Show in the map")
     page.wait_for_selector(".topmap .over .camera")
+    page.reload()  # that it is shown in the map is in the address
+    page.wait_for_selector(".topmap .over .camera")
     visit.shot("sql")
     visit.check_accessible("sql")
     with page.expect_download() as download:

@@ -27,7 +27,8 @@ const MOST_LABELLED = 600;
 const LABELS_IN_HASTE = 14; // while the view moves, where the processor draws
 
 export interface ViewerOptions {
-  picked: (what: Picked) => void;
+  /** Something was clicked; without it nothing can be. */
+  picked?: (what: Picked) => void;
   /** The view was moved by hand, or flew: see `state`. */
   moved: () => void;
 }
@@ -333,10 +334,10 @@ export class Viewer {
     canvas.addEventListener("pointerdown", (event) => (down = { x: event.offsetX, y: event.offsetY }));
     canvas.addEventListener("pointerup", (event) => {
       if (!down || Math.hypot(event.offsetX - down.x, event.offsetY - down.y) > 4) return;
-      this.options.picked(this.pick(event.offsetX, event.offsetY, event.pointerType === "touch" ? 20 : 11));
+      this.options.picked?.(this.pick(event.offsetX, event.offsetY, event.pointerType === "touch" ? 20 : 11));
     });
     canvas.addEventListener("pointermove", (event) => {
-      if (event.buttons !== 0) return;
+      if (event.buttons !== 0 || !this.options.picked) return;
       cancelAnimationFrame(hovering);
       hovering = requestAnimationFrame(() => (canvas.style.cursor = this.pick(event.offsetX, event.offsetY, 9) ? "pointer" : ""));
     });

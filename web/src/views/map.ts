@@ -1,6 +1,6 @@
 // A map: in space or from above, its things and keyframes beside it, one of them in detail.
 import { get, getBytes, isAbort, part } from "../api";
-import { type MapScene, type SceneColumns, pointsOf, sceneOf } from "../model";
+import { MOST_POINTS, type MapScene, type SceneColumns, pointsOf, sceneOf } from "../model";
 import { type Context, type Updatable, go, link, setQuery } from "../router";
 import type { Layer, Mode, Picked, Viewer } from "../scene/viewer";
 import { texts } from "../texts";
@@ -15,7 +15,6 @@ import { Search } from "./map/search";
 
 const LAYER_NAMES = Object.keys(texts.map.layers) as Layer[];
 const OFF_AT_FIRST: readonly Layer[] = ["uncertainty"];
-const POINTS = 100_000;
 
 /** What the parts of the view share. */
 export interface MapContext {
@@ -33,7 +32,7 @@ export async function map({ root, until, params, query }: Context): Promise<Upda
   const asked = get<SceneColumns>(`/v1/maps/${part(name)}/scene`, until);
   // what comes after it is asked for at once
   const viewer = import("../scene/viewer");
-  const points = getBytes(`/v1/maps/${part(name)}/points?count=${POINTS}`, until);
+  const points = getBytes(`/v1/maps/${part(name)}/points?count=${MOST_POINTS}`, until);
   for (const early of [viewer, points]) early.catch(() => undefined); // told where they are used
   const scene = sceneOf(await asked);
   const view = new MapView(name, scene, until, { viewer, points });

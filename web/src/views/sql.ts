@@ -95,7 +95,7 @@ class SqlPage {
     if (new URLSearchParams(location.search).get("q") === text) void this.run();
     else {
       this.ran = text;
-      setQuery({ q: text }, false);
+      setQuery({ q: text, show: null }, false);
       void this.run();
     }
   }
@@ -137,6 +137,12 @@ class SqlPage {
       h("tbody", null, shown.map((row) => h("tr", null, row.map((value, k) => h("td", { class: numeric[k] ? "number" : "", ...(value === null ? { attrs: { "aria-label": "null" } } : {}) }, cell(value)))))),
     );
     const map = h("div");
+    const canShow = rowsInMaps.can(found);
+    const showInMaps = (): void => {
+      setQuery({ show: "map" });
+      void rowsInMaps.show(map, found, this.until);
+    };
+    if (canShow && new URLSearchParams(location.search).get("show") === "map") showInMaps();
     return h(
       "div",
       { class: "stack" },
@@ -147,7 +153,7 @@ class SqlPage {
         h("span", { class: "faint" }, t.took(ms)),
         found.truncated && h("span", { class: "tag warn" }, t.truncated),
         button(t.csv, () => void save(`/v1/sql?${new URLSearchParams({ sql: text, format: "csv" })}`, "rows.csv", this.until)),
-        rowsInMaps.can(found) && button(t.inMap, () => void rowsInMaps.show(map, found, this.until)),
+        canShow && button(t.inMap, showInMaps),
       ),
       map,
       found.rows.length === 0 ? empty(t.noRows) : h("div", { class: "table-wrap rows", attrs: { tabindex: 0, role: "region", "aria-label": t.result } }, table),

@@ -1,7 +1,7 @@
 // A keyframe: its image with what is seen in it, what is near it, what it was good for.
 import { get, load, part, token } from "../../api";
 import { type KeyframeItem, css, distance, dot, hueColour } from "../../model";
-import { link } from "../../router";
+import { link, setQuery } from "../../router";
 import { texts } from "../../texts";
 import type { KeypointColumns, LoggedQuery, RunLengths, SeenObject, Sighting } from "../../types";
 import { type Child, bdi, fill, h } from "../../ui/h";
@@ -73,11 +73,27 @@ function picture(context: MapContext, item: KeyframeItem, objects: Promise<{ obj
   };
   const tick = (label: string, on: boolean, act: (on: boolean) => void): HTMLElement =>
     h("label", { class: "inline" }, h("input", { attrs: { type: "checkbox", checked: on }, on: { change: (event) => act((event.target as HTMLInputElement).checked) } }), label);
+  // what is marked is part of the address: objects, unless it says otherwise
+  const marks = new Set((new URLSearchParams(location.search).get("marks") ?? "objects").split(","));
+  const mark = (name: string, on: boolean): void => {
+    if (on) marks.add(name);
+    else marks.delete(name);
+    const names = [...marks].filter((one) => one === "objects" || one === "keypoints").sort();
+    setQuery({ marks: names.join() === "objects" ? null : names.join() || "none" });
+  };
+  masks.hidden = !marks.has("objects");
+  showPoints(marks.has("keypoints"));
   return h(
     "figure",
     { class: "keyframe-picture" },
     h("div", { class: "layers-of-picture" }, image, masks, points),
-    h("figcaption", { class: "row small" }, tick(texts.keyframe.masks, true, (on) => (masks.hidden = !on)), tick(texts.keyframe.points, false, showPoints)),
+    h("figcaption", { class: "row small" }, tick(texts.keyframe.masks, marks.has("objects"), (on) => {
+      masks.hidden = !on;
+      mark("objects", on);
+    }), tick(texts.keyframe.points, marks.has("keypoints"), (on) => {
+      showPoints(on);
+      mark("keypoints", on);
+    })),
   );
 }
 

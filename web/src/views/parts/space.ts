@@ -1,6 +1,6 @@
 // The map in space with cameras that are none of its own: photos, queries, robots. Without WebGL, a plan.
 import { getBytes, isAbort, part } from "../../api";
-import { type KeyframeItem, type MapScene, axesOf, pointsOf } from "../../model";
+import { type KeyframeItem, MOST_POINTS, type MapScene, axesOf, pointsOf } from "../../model";
 import { setQuery } from "../../router";
 import type { Extra, Mode, Viewer } from "../../scene/viewer";
 import { texts } from "../../texts";
@@ -12,7 +12,6 @@ import { theme } from "../../ui/theme";
 import { TopMap } from "../../ui/topmap";
 import { kindOf } from "./evidence";
 
-const POINTS = 60_000;
 const PAINTS = { good: "--good", warn: "--warn", bad: "--bad", accent: "--accent", old: "--ink-2" } as const;
 
 /** A camera that is drawn: where, how sure, under which name. */
@@ -55,14 +54,14 @@ export class Space {
   }
 
   private async begin(): Promise<void> {
-    const asked = getBytes(`/v1/maps/${part(this.scene.name)}/points?count=${POINTS}`, this.until).catch((error: unknown) => {
+    const asked = getBytes(`/v1/maps/${part(this.scene.name)}/points?count=${MOST_POINTS}`, this.until).catch((error: unknown) => {
       if (!isAbort(error)) toast(texts.map.noPoints);
       return null;
     });
     try {
       const { Viewer } = await import("../../scene/viewer");
       if (this.until.aborted) return;
-      this.viewer = new Viewer(this.scene, { picked: () => undefined, moved: () => this.remember() }, ["uncertainty"]);
+      this.viewer = new Viewer(this.scene, { moved: () => this.remember() }, ["uncertainty"]);
     } catch {
       this.plan = new TopMap(this.scene);
       fill(this.stage, this.plan.element);
