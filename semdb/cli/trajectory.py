@@ -192,7 +192,7 @@ def print_summary(found: RecordedTrajectory, recording: Recording, seconds: floa
         ("time", f"{measure(told['seconds_per_frame'], 3)} s per frame, {measure(seconds, 1)} s in all"),
     ]
     if not found.timed:
-        lines.append(("note", "frames have no times: 30 a second are assumed, and indexes stand for times"))
+        lines.append(("note", "frames have no times that go on: 30 a second are assumed, and indexes stand for times"))
     if len(pieces) > 1:
         lines.append(("pieces", f"{len(pieces)} that nothing joins; the largest is used"))
         lines += [

@@ -155,7 +155,7 @@ class TrackingCameras(Localizing):
         entries = opened.entries[::every]
         times_s, timed = times_of(entries)
         if not timed:
-            self._say(f"{opened.name}: frames have no times; {ASSUMED_RATE_HZ:g} a second are assumed")
+            self._say(f"{opened.name}: frames have no times that go on; {ASSUMED_RATE_HZ:g} a second are assumed")
         with self.tracker(map) as tracker:
             for entry, time_s in zip(entries, times_s, strict=True):
                 try:

@@ -178,7 +178,7 @@ def told(found: RecordedTrajectory) -> list[str]:
             )
         )
     if not found.timed:
-        lines.append("it has no times: 30 frames a second are assumed")
+        lines.append("it has no times that go on from frame to frame: 30 frames a second are assumed")
     return lines
 
 

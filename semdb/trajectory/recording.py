@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -74,10 +75,13 @@ def find_recorded(
 
 
 def times_of(entries: tuple[FrameEntry, ...]) -> tuple[FloatArray, bool]:
-    """Seconds since the first frame ``[n]``, and whether the recording says them; else 30 frames a second."""
+    """Seconds since the first frame ``[n]``, and whether the recording says them; else 30 frames a second.
+
+    Times that do not go on from frame to frame say nothing of how the camera moved.
+    """
     stamps = [entry.timestamp_ns for entry in entries]
     known = [stamp for stamp in stamps if stamp is not None]
-    if len(known) == len(stamps):
+    if len(known) == len(stamps) and all(before < after for before, after in pairwise(known)):
         return np.array([stamp - known[0] for stamp in known], np.float64) / 1e9, True
     indexes = np.array([entry.index for entry in entries], np.float64)
     return (indexes - indexes[:1]) / ASSUMED_RATE_HZ, False

@@ -23,7 +23,7 @@ from semdb.trajectory.files import trajectory_text
 from semdb.trajectory.measuring import joined
 from semdb.trajectory.motion import Motion, turn_rates
 from semdb.trajectory.odometry import FrameState
-from semdb.trajectory.recording import RecordedTrajectory
+from semdb.trajectory.recording import RecordedTrajectory, times_of
 from semdb.trajectory.result import Drift, FramePose, PieceSummary, Trajectory
 from semdb.types import Camera, FloatArray
 
@@ -215,6 +215,19 @@ def test_files_have_the_times_of_the_recording() -> None:
     untimed = trajectory_text(RecordedTrajectory(trajectory, (entry,), False))
     assert "frame index" in untimed.splitlines()[1]
     assert untimed.splitlines()[3].startswith("7.000000000 ")
+
+
+def test_times_that_go_back_are_none() -> None:
+    def entries(*stamps: int | None) -> tuple[FrameEntry, ...]:
+        return tuple(
+            FrameEntry(3 * n, f"{n}.png", at, Path(f"{n}.png"), None, None, None) for n, at in enumerate(stamps)
+        )
+
+    times_s, timed = times_of(entries(5_000_000_000, 6_000_000_000, 6_500_000_000))
+    assert (times_s.tolist(), timed) == ([0.0, 1.0, 1.5], True)
+    for stamps in ((2, 1, 0), (0, 5, 5), (0, None, 7)):
+        times_s, timed = times_of(entries(*stamps))
+        assert (times_s.tolist(), timed) == ([0.0, 0.1, 0.2], False)
 
 
 def test_closures_are_shown_by_their_frames() -> None:
