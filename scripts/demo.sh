@@ -49,7 +49,8 @@ step evaluate "$out/room" --keyframes "$keyframes" --max-queries "$queries" \
 
 echo
 echo "pictures:"
-find "$out" -name '*.png' -not -path "$out/room/*" | sort | sed 's/^/  /'
+find "$out" -name '*.png' -not -path "$out/room/*" -not -path "$out/photos/*" | sort | sed 's/^/  /'
+echo "photos to drop on the page of make serve: $out/photos"
 "$python" - "$out/evaluation.json" <<'PYTHON'
 import json
 import sys

@@ -15,6 +15,17 @@ from tests.serving import Served, png
 HOSTILE = "<img src=x onerror=alert(1)> \"quoted\" 'and' right to left: مطبخ &amp;"
 WORSE = HOSTILE.replace("right to left", "\u202eright to left\u202c")  # no map may be called so; images may
 READY = "html[data-ready=map]"
+TURN = """(frames) => new Promise(done => {
+    const { viewer } = document.querySelector('.viewer');
+    const { state } = viewer;
+    let left = frames;
+    const step = () => {
+        const [x, y, z] = state.position;
+        viewer.state = { ...state, position: [x + Math.sin(left / 9), y + Math.cos(left / 9), z] };
+        if (--left) requestAnimationFrame(step); else done();
+    };
+    step();
+})"""
 
 
 @dataclass

@@ -12,7 +12,7 @@ from playwright.sync_api import expect
 from sqlalchemy import text as statement
 
 from tests.browsing import Visit, browser_cpu_ms, visiting
-from tests.integration.page.helpers import HOSTILE, READY, World, address, drawn, opened, viewer
+from tests.integration.page.helpers import HOSTILE, READY, TURN, World, address, drawn, opened, viewer
 
 
 def test_from_a_card_to_a_map_to_a_thing_and_back(visit: Visit, world: World) -> None:
@@ -105,7 +105,8 @@ def test_every_state_has_an_address(visit: Visit, world: World) -> None:
     page.locator(".layers summary").click()
     page.get_by_label("Points").uncheck()
     assert "points" in page.url
-    page.get_by_role("tab", name="Keyframes").click()
+    page.get_by_role("tab", name="Things").focus()
+    page.keyboard.press("ArrowRight")
     page.get_by_label("Filter by recording or frame").fill("frame-that-is-none")
     page.wait_for_function("() => location.search.includes('filter=')")
     page.reload()
@@ -180,17 +181,6 @@ POINTS = """() => {
     const positions = new Float32Array(3 * count).map((_, k) => [x, y, z][k % 3] + (Math.random() - 0.5) * wide);
     viewer.setPoints({ count, keyframes: 4, positions, colours: new Uint8Array(3 * count).fill(150) });
 }"""
-TURN = """(frames) => new Promise(done => {
-    const { viewer } = document.querySelector('.viewer');
-    const { state } = viewer;
-    let left = frames;
-    const step = () => {
-        const [x, y, z] = state.position;
-        viewer.state = { ...state, position: [x + Math.sin(left / 9), y + Math.cos(left / 9), z] };
-        if (--left) requestAnimationFrame(step); else done();
-    };
-    step();
-})"""
 
 
 def test_a_hundred_thousand_points_are_drawn_in_frames_of_less_than_a_tenth_of_a_second(

@@ -35,7 +35,7 @@ export class Panel {
     this.tabs = (["things", "frames"] as const).map((name) =>
       h("button", { attrs: { type: "button", role: "tab" }, on: { click: () => setQuery({ list: name === this.usual ? null : name, filter: null }, false) } }, name === "things" ? texts.map.things : texts.map.keyframes),
     );
-    this.element.append(h("div", { class: "panel-tabs", attrs: { role: "tablist" } }, this.tabs), h("div", { class: "panel-filter" }, this.filter), this.body);
+    this.element.append(h("div", { class: "panel-tabs", attrs: { role: "tablist" }, on: { keydown: (event) => this.turn(event) } }, this.tabs), h("div", { class: "panel-filter" }, this.filter), this.body);
     theme.watch(() => this.list(), until);
     this.usual = scene.landmarks.length > 0 || scene.keyframes.length === 0 ? "things" : "frames";
     this.follow(new URLSearchParams(location.search));
@@ -49,6 +49,15 @@ export class Panel {
     if (tab === this.tab && wanted === this.filter.value) return;
     if (wanted !== this.filter.value) this.filter.value = wanted;
     this.open(tab);
+  }
+
+  /** Arrows go from tab to tab. */
+  private turn(event: KeyboardEvent): void {
+    if (event.key !== "ArrowLeft" && event.key !== "ArrowRight") return;
+    event.preventDefault();
+    const other = this.tabs[this.tab === "things" ? 1 : 0];
+    other?.focus();
+    other?.click();
   }
 
   private filtered(): void {
