@@ -125,7 +125,7 @@ class Reading:
         from semdb.client.values import link_of
 
         names = [info.name for info in self.maps()] if map is None else [map]
-        asked = {
+        asked: dict[str, Any] = {
             "odometry": odometry or None,
             "after": None if after is None else "-".join(str(part) for part in after),
         }
@@ -208,14 +208,14 @@ class Reading:
         given = {name: _text(value) for name, value in parameters.items() if value is not None}
         return self._transport.json("GET", path, params=given)
 
-    def _pages(self, path: str, limit: int | None = None, **parameters: Any) -> Iterator[Any]:
-        """The items of a list, page by page."""
+    def _pages(self, path: str, limit: int | None = None, *, under: str = "items", **parameters: Any) -> Iterator[Any]:
+        """The items of a list, page by page; `under` is what the answer calls them."""
         by = "before" if "before" in parameters else "after"  # lists with the newest first go backwards
         left, key = limit, parameters.pop(by, None)
         while left is None or left > 0:
             page = self._get(path, **parameters, **{by: key}, limit=PAGE if left is None else min(PAGE, left))
-            yield from page["items"]
-            left = None if left is None else left - len(page["items"])
+            yield from page[under]
+            left = None if left is None else left - len(page[under])
             key = page["key"]
             if key is None:
                 return

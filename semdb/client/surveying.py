@@ -114,8 +114,8 @@ class Surveying(Reading):
         """The objects that show a landmark of a map, by time. Raises NotFoundError."""
         from semdb.client.things import sighting_of
 
-        found = self._get(f"/v1/maps/{segment(map)}/landmarks/{_id(landmark, 'landmark')}/sightings")
-        return [sighting_of(one) for one in found["sightings"]]
+        path = f"/v1/maps/{segment(map)}/landmarks/{_id(landmark, 'landmark')}/sightings"
+        return [sighting_of(one) for one in self._pages(path, under="sightings")]
 
     def visits(self, map: str, landmark: int) -> list[LandmarkVisit]:
         """What each recording of a map says of a landmark: where it was, or that it was not there or not looked at.
@@ -124,8 +124,8 @@ class Surveying(Reading):
         """
         from semdb.client.things import visit_of
 
-        found = self._get(f"/v1/maps/{segment(map)}/landmarks/{_id(landmark, 'landmark')}/sightings")
-        return [visit_of(one) for one in found["visits"]]
+        path = f"/v1/maps/{segment(map)}/landmarks/{_id(landmark, 'landmark')}/sightings"
+        return [visit_of(one) for one in self._get(path, limit=1)["visits"]]
 
     def seen_in(self, keyframe_id: int) -> list[StoredSighting]:
         """The landmarks that a keyframe shows, with the objects that show them. Raises NotFoundError."""
@@ -161,7 +161,7 @@ class Surveying(Reading):
 
         if not 1 <= limit <= MOST_QUERIES:
             raise UsageError(f"limit is between 1 and {MOST_QUERIES}, not {limit}")
-        asked = {} if wanted is None else {"verdict": wanted.verdict, "text": wanted.text}
+        asked: dict[str, Any] = {} if wanted is None else {"verdict": wanted.verdict, "text": wanted.text}
         if wanted is not None:
             asked |= {"since": _moment(wanted.since), "until": _moment(wanted.until)}
         keyframe = None if wanted is None else wanted.keyframe_id
@@ -180,7 +180,7 @@ class Surveying(Reading):
         from semdb.database.records import FailedItem
 
         path = f"/v1/maps/{segment(map)}/recordings/{segment(recording)}"
-        found = self._get(f"{path}/failures")["failures"]
+        found = list(self._pages(f"{path}/failures", under="failures"))
         known = self._get(path)["id"] if found else 0
         return [FailedItem(known, one["frame_index"], one["attempts"], one["error"]) for one in found]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 from urllib.parse import urlencode
 
@@ -72,12 +72,18 @@ def page_of(
     shown: Callable[[T], Any],
     *,
     by: str = "after",
+    under: str = "items",
+    also: Mapping[str, Any] | None = None,
 ) -> Response:
-    """The first `limit` of `items`, which are one more where there are more, and the address of what follows."""
+    """The first `limit` of `items`, which are one more where there are more, and the address of what follows.
+
+    They are `under` that name, beside what the answer has `also`.
+    """
     more = len(items) > limit
     items = items[:limit]
     last = str(key(items[-1])) if more and items else None
-    return as_json({"items": [shown(item) for item in items], "next": _next(request, by, last), "key": last})
+    shown_items = [shown(item) for item in items]
+    return as_json({**(also or {}), under: shown_items, "next": _next(request, by, last), "key": last})
 
 
 def _next(request: Request, name: str, key: str | None) -> str | None:
@@ -85,8 +91,3 @@ def _next(request: Request, name: str, key: str | None) -> str | None:
         return None
     given = [(k, v) for k, v in request.query_params.multi_items() if k != name]
     return f"{request.scope['raw_path'].decode('ascii')}?{urlencode([*given, (name, key)])}"
-
-
-def after_key(items: Sequence[T], after: str | None, key: Callable[[T], Any], read: Callable[[str], Any]) -> list[T]:
-    """Those of a sorted list that come after a key. A key that is none gives what follows it all the same."""
-    return list(items) if after is None else [item for item in items if key(item) > read(after)]

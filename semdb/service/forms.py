@@ -22,21 +22,22 @@ class Memory:
     """How much of forms may be in memory; used on the loop alone."""
 
     def __init__(self, most: int = MOST_AT_ONCE, largest: int = LARGEST) -> None:
-        self._left, self._largest = most, largest
+        self._most, self._largest = most, largest
+        self.held = 0  # bytes
 
     @contextmanager
     def room_for(self, request: Request) -> Iterator[bool]:
         """Whether there is room for the body of a request, which is held meanwhile."""
         told = request.headers.get("content-length", "")
         size = int(told) if told.isdigit() else self._largest + 1
-        if size > self._largest or size > self._left:
+        if size > self._largest or self.held + size > self._most:
             yield False
             return
-        self._left -= size
+        self.held += size
         try:
             yield True
         finally:
-            self._left += size
+            self.held -= size
 
 
 class _InMemory(MultiPartParser):

@@ -23,6 +23,7 @@ from semdb.service.state import access_of, read, service_of
 
 table = Table("jobs")
 MOST_ENTRIES = 500
+MOST_FAILURES = 1000  # of a page that does not say how many
 
 
 @table.route("GET", "/v1/jobs", INGEST, schemas.Page[job_schemas.JobModel])
@@ -98,10 +99,21 @@ def _entries(roots: tuple[str, ...]) -> list[dict[str, Any]]:
 
 
 @table.route("GET", "/v1/maps/{map}/recordings/{recording}/failures", INGEST, job_schemas.Failures)
-async def list_failures(request: Request, map: MapName, recording: str) -> Response:
-    """The keyframes of a recording that could not be stored, and why."""
+async def list_failures(
+    request: Request,
+    map: MapName,
+    recording: str,
+    after: Annotated[int, Query(ge=-1, le=2**63 - 1, description="frame index: what comes after it")] = -1,
+    limit: Limit = None,
+) -> Response:
+    """The keyframes of a recording that could not be stored, and why, by frame index."""
     found = await read(request, lambda db: db.failures(recording, map))
-    shown = [
-        {"frame_index": one.frame_index, "attempts": one.attempts, "error": scrubbed(one.error)} for one in found[:1000]
-    ]
-    return as_json({"map": map, "recording": recording, "failures": shown})
+    later = [one for one in found if one.frame_index > after]
+    most = limit or MOST_FAILURES
+    return page_of(
+        *(request, later[: most + 1], most),
+        lambda one: one.frame_index,
+        lambda one: {"frame_index": one.frame_index, "attempts": one.attempts, "error": scrubbed(one.error)},
+        under="failures",
+        also={"map": map, "recording": recording},
+    )

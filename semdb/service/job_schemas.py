@@ -52,6 +52,8 @@ class Failures(Model):
     map: str
     recording: str
     failures: list[Failure]
+    next: str | None = Field(description="address of the next page; null at the end")
+    key: str | None = Field(description="key of the last one, where more follow")
 
 
 class UploadModel(Model):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
@@ -12,16 +13,20 @@ from starlette.responses import Response
 
 import semdb
 from semdb.api import Database
+from semdb.database.scene_reading import StoredSighting
 from semdb.service import scene_schemas as schemas
 from semdb.service import values
-from semdb.service.answers import as_json, encoded, has, tag_of, tagged
+from semdb.service.answers import as_json, encoded, has, page_of, tag_of, tagged
 from semdb.service.keyframe_routes import keyframe_of
+from semdb.service.problems import Problem
 from semdb.service.roles import READ
-from semdb.service.routing import KeyframeId, MapName, Table
+from semdb.service.routing import KeyframeId, Limit, MapName, Table
 from semdb.service.state import draw, read, service_of
 
 table = Table("views")
+MOST_SIGHTINGS = 1000  # of a page that does not say how many
 MOST_KEPT = 4  # scenes, and clouds, in memory
+_KEY = re.compile(r"(-?[0-9]{1,19}|)\.([0-9]{1,19})", re.ASCII)
 _FILE = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
 _clouds: OrderedDict[tuple[str, str, str, int], bytes] = OrderedDict()
 _scenes: OrderedDict[tuple[str, str, str, int], bytes] = OrderedDict()
@@ -76,11 +81,38 @@ def _kept(
 
 
 @table.route("GET", "/v1/maps/{map}/landmarks/{landmark}/sightings", READ, schemas.LandmarkHistory)
-async def list_sightings(request: Request, map: MapName, landmark: KeyframeId) -> Response:
+async def list_sightings(
+    request: Request,
+    map: MapName,
+    landmark: KeyframeId,
+    after: Annotated[str | None, Query(max_length=50, description="key of an earlier page")] = None,
+    limit: Limit = None,
+) -> Response:
     """The objects of keyframes that show a landmark, by time, and what each recording says of it."""
+    last = None if after is None else _moment_key(after)
     found, visits = await read(request, lambda db: (db.sightings(map, landmark), db.visits(map, landmark)))
-    shown = {"sightings": [values.sighting_dict(one) for one in found]}
-    return as_json(shown | {"visits": [values.visit_dict(one) for one in visits]})
+    later = [one for one in found if last is None or _moment(one) > last]
+    most = limit or MOST_SIGHTINGS
+    return page_of(
+        *(request, later[: most + 1], most),
+        lambda one: f"{'' if one.timestamp_ns is None else one.timestamp_ns}.{one.object_id}",
+        values.sighting_dict,
+        under="sightings",
+        also={"visits": [values.visit_dict(one) for one in visits]},
+    )
+
+
+def _moment(found: StoredSighting) -> tuple[bool, int, int]:
+    """By what sightings are in order: those without a time come first."""
+    return found.timestamp_ns is not None, found.timestamp_ns or 0, found.object_id
+
+
+def _moment_key(text: str) -> tuple[bool, int, int]:
+    """A time, or none, and the id of an object. Raises Problem 422."""
+    found = _KEY.fullmatch(text)
+    if found is None:
+        raise Problem(422, "after is no key of an earlier page")
+    return found[1] != "", int(found[1] or 0), int(found[2])
 
 
 @table.route("GET", "/v1/keyframes/{keyframe}/landmarks", READ, schemas.Sightings)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pydantic import Field
+
 from semdb.service.schemas import Model, Vector3
 
 
@@ -44,6 +46,8 @@ class LandmarkHistory(Sightings):
     """Objects that show a landmark, by time, and what each recording says of it."""
 
     visits: list[Visit]
+    next: str | None = Field(description="address of the next page of sightings; null at the end")
+    key: str | None = Field(description="key of the last one, where more follow")
 
 
 class KeyframeColumns(Model):

@@ -305,6 +305,27 @@ def test_a_body_that_comes_slowly_is_let_go(served: Served, tokens: dict[str, st
         assert 0.5 < time.monotonic() - started < 8
 
 
+def test_a_client_that_breaks_off_leaves_nothing_behind(
+    served: Served, tokens: dict[str, str], names: list[str]
+) -> None:
+    host, port = served.url.removeprefix("http://").split(":")
+    head = (
+        f"POST /v1/maps/{names[0]}/localize HTTP/1.1\r\nHost: {host}\r\nAuthorization: Bearer {tokens['localize']}\r\n"
+        "Content-Type: multipart/form-data; boundary=b\r\nContent-Length: 100000\r\n\r\n--b\r\n"
+    )
+    for _ in range(8):
+        with socket.create_connection((host, int(port)), timeout=10) as broken:
+            broken.sendall(head.encode() + b"x" * 50_000)
+    forms, ends = served.service.forms, time.monotonic() + 20
+    while forms.held and time.monotonic() < ends:
+        time.sleep(0.02)
+    assert (forms.held, served.service.localizing.inside) == (0, 0)
+    with served.with_token(tokens["localize"]) as client:
+        address = f"/v1/maps/{names[0]}/localize"
+        assert client.post(address, files={"image": b"none"}).status_code == 422
+    assert forms.held == 0
+
+
 def test_headers_that_come_slowly_are_let_go(served: Served) -> None:
     host, port = served.url.removeprefix("http://").split(":")
     whole = f"GET /health HTTP/1.1\r\nHost: {host}\r\n\r\n".encode()

@@ -24,15 +24,15 @@ PATHS = (
 )
 
 
-def pages(served: Served, path: str, limit: int) -> list[Any]:
+def pages(served: Served, path: str, limit: int, under: str = "items") -> list[Any]:
     """All items of a list, `limit` at a time."""
     address: str | None = f"{path}{'&' if '?' in path else '?'}limit={limit}"
     found = []
     while address:
         answer = served.client.get(address)
         assert answer.status_code == 200, answer.text
-        assert len(answer.json()["items"]) <= limit
-        found += answer.json()["items"]
+        assert len(answer.json()[under]) <= limit
+        found += answer.json()[under]
         address = answer.json()["next"]
     return found
 
@@ -49,6 +49,19 @@ def test_lists_come_page_by_page(
             assert len(whole) > 1, path
             for limit in (1, 2, len(whole) - 1, len(whole)):
                 assert pages(served, path, limit) == whole, (path, limit)
+        with store.engine.begin() as connection:
+            connection.exec_driver_sql("UPDATE ingest_items SET state = 'failed', error = 'no light'")
+        name = store.status(map_id)[0].name.replace(" ", "%20")
+        for path, under in (
+            (f"/v1/maps/room/landmarks/{things[0]}/sightings", "sightings"),
+            (f"/v1/maps/room/recordings/{name}/failures", "failures"),
+        ):
+            whole = pages(served, path, 1000, under)
+            assert len(whole) > 2, path
+            for limit in (1, 2, len(whole)):
+                assert pages(served, path, limit, under) == whole, (path, limit)
+            assert served.client.get(path, params={"after": "'; DROP"}).status_code == 422
+        assert len(served.client.get(f"/v1/maps/room/landmarks/{things[0]}/sightings?limit=1").json()["visits"]) == 1
         links = pages(served, PATHS[0], 1)
         assert [(one["keyframe"], one["other_keyframe"]) for one in links] == [
             *(

@@ -91,7 +91,8 @@ def test_sightings_go_both_ways(served: Served) -> None:
     assert one in back
     objects = served.client.get(f"/v1/keyframes/{one['keyframe']}/objects").json()["objects"]
     assert objects[one["ordinal"]]["box"] == pytest.approx(one["box"])
-    assert served.client.get("/v1/maps/empty/landmarks/1/sightings").json() == {"sightings": [], "visits": []}
+    nothing = {"sightings": [], "visits": [], "next": None, "key": None}
+    assert served.client.get("/v1/maps/empty/landmarks/1/sightings").json() == nothing
     assert served.client.get("/v1/keyframes/999999/landmarks").status_code == 404
 
 

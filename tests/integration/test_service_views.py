@@ -144,7 +144,7 @@ def test_jobs_are_listed_and_done_again(served: Served, room: Path) -> None:
     assert asked(served, "/v1/jobs", map="elsewhere").json()["items"] == []
     assert served.client.post("/v1/jobs/9999/retry").status_code == 404
     failures = asked(served, "/v1/maps/office/recordings/room/failures").json()
-    assert failures == {"map": "office", "recording": "room", "failures": []}
+    assert failures == {"map": "office", "recording": "room", "failures": [], "next": None, "key": None}
 
 
 def test_cameras_that_are_tracked_are_seen_by_those_who_watch(served: Served, frames: list[Frame]) -> None:
