@@ -36,7 +36,8 @@ def refusal(recording: Recording, certain: Sequence[Finding]) -> str:
     reasons = "; ".join(finding.message for finding in certain)
     options = " ".join(finding.option for finding in certain if finding.option)
     mend = f"; say {options}" if options else ""
-    return f"{recording.path}: its images contradict how it is read: {reasons}{mend} (--no-check ingests it as it is)"
+    told = f"its images contradict how it is read: {reasons}{mend}"
+    return f"{recording.whereabouts}: {told} (--no-check ingests it as it is)"
 
 
 def as_row(finding: Finding) -> RecordingFinding:

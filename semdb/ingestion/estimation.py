@@ -121,7 +121,9 @@ def posed(
     brings = any(entry.world_from_camera is not None for entry in recording.entries)
     if poses == RECORDED or (poses == AUTO and brings):
         if not brings:
-            raise RecordingError(f"{recording.path}: brings no poses; --poses estimated finds them from its images")
+            raise RecordingError(
+                f"{recording.whereabouts}: brings no poses; --poses estimated finds them from its images"
+            )
         return Posed(recording)
     _refuse_others(store, map_name)
     (say or _nobody)(

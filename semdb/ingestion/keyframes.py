@@ -54,7 +54,7 @@ def select_keyframes(
         raise UsageError(f"the stride must be at least 1, but is {stride}")
     entries = [entry for entry in recording.entries if entry.world_from_camera is not None]
     if not entries:
-        raise RecordingError(f"{recording.path}: no frame has a pose, so none can become a keyframe")
+        raise RecordingError(f"{recording.whereabouts}: no frame has a pose, so none can become a keyframe")
     if stride is not None:
         return entries[::stride]
     entries, overlap_with = _compare_views(recording, entries, progress)
@@ -62,11 +62,11 @@ def select_keyframes(
     lost = [entry for entry in keep if entry.index not in {other.index for other in entries}]
     if count is not None and count > len(entries) + len(lost):
         raise UsageError(
-            f"{recording.path}: {count} keyframes were asked for, but only "
+            f"{recording.whereabouts}: {count} keyframes were asked for, but only "
             f"{len(entries) + len(lost)} frames can be used"
         )
     if not entries:
-        raise RecordingError(f"{recording.path}: no depth image can be decoded")
+        raise RecordingError(f"{recording.whereabouts}: no depth image can be decoded")
     poses = np.stack([entry.world_from_camera for entry in entries if entry.world_from_camera is not None])
     first = [i for i, entry in enumerate(entries) if entry.index in kept] or [0]
     left = None if count is None else count - len(lost)

@@ -24,7 +24,7 @@ from semdb.recordings.images import (
 )
 from semdb.recordings.options import AS_THE_FORMAT_SAYS, ReadOptions
 from semdb.recordings.registration import decode_registered_depth
-from semdb.types import Camera, Float32Array, FloatArray, Frame, ImageArray, InstanceMasks
+from semdb.types import FROM_MEMORY, Camera, Float32Array, FloatArray, Frame, ImageArray, InstanceMasks
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,6 +126,11 @@ class Recording:
     def said(self) -> tuple[str, ...]:
         """All that people should know about how the recording was read."""
         return tuple(dict.fromkeys((*self.notes, *self.assumed)))
+
+    @property
+    def whereabouts(self) -> str:
+        """For messages: its folder, or its name where frames came from memory."""
+        return self.name if self.format == FROM_MEMORY else str(self.path)
 
     def camera_of(self, entry: FrameEntry) -> Camera:
         """The camera of a frame: its own where frames differ in it."""

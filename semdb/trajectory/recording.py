@@ -50,8 +50,8 @@ def find_recorded(
     entries = recording.entries[::every]
     if not any(entry.depth_path is not None for entry in entries):
         raise RecordingError(
-            f"{recording.path}: no frame has depth, and without depth no trajectory is found: images alone do not say "
-            "how large a room is"
+            f"{recording.whereabouts}: no frame has depth, and without depth no trajectory is found: images alone do "
+            "not say how large a room is"
         )
     options = options or TrajectoryOptions()
 
@@ -70,7 +70,7 @@ def find_recorded(
         progress,
     )
     if not found.used:
-        raise RecordingError(f"{recording.path}: no frame can be placed; the first: {found.frames[0].reason}")
+        raise RecordingError(f"{recording.whereabouts}: no frame can be placed; the first: {found.frames[0].reason}")
     return RecordedTrajectory(found, entries, timed)
 
 

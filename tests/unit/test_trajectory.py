@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -353,6 +353,8 @@ def test_the_door_finds_a_trajectory_of_a_folder_and_of_frames(room_path: Path, 
         folder, memory = db.trajectory(room_path, every=3), db.trajectory(frames())
         with pytest.raises(UsageError, match="every must be at least 1"):
             db.trajectory(room_path, every=0)
+        with pytest.raises(RecordingError, match=r"^frames: no frame has depth"):
+            db.trajectory(replace(frame, depth=None) for frame in frames())
     assert not (tmp_path / "none.sqlite3").exists()
     assert len(folder.trajectory.used) == len(memory.trajectory.used) == 8
     assert [entry.timestamp_ns for entry in folder.entries] == [entry.timestamp_ns for entry in memory.entries]
