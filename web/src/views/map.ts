@@ -30,9 +30,9 @@ export async function map({ root, until, params, query }: Context): Promise<Upda
   root.className = "map";
   fill(root, loading(texts.map.waiting));
   const asked = get<SceneColumns>(`/v1/maps/${part(name)}/scene`, until);
-  // what comes after it is asked for at once
+  // what comes after it is asked for early; the points not at the same time, or the service would work at both
   const viewer = import("../scene/viewer");
-  const points = getBytes(`/v1/maps/${part(name)}/points?count=${MOST_POINTS}`, until);
+  const points = asked.then(() => getBytes(`/v1/maps/${part(name)}/points?count=${MOST_POINTS}`, until));
   for (const early of [viewer, points]) early.catch(() => undefined); // told where they are used
   const scene = sceneOf(await asked);
   const view = new MapView(name, scene, until, { viewer, points });
