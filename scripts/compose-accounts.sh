@@ -15,10 +15,10 @@ semdb_readable() {
     keyframe_categories keyframe_changes keyframe_images keyframe_qualities keyframes keypoints \
     landmark_merges landmark_relations landmark_sightings landmark_views landmark_visits landmarks \
     loop_closures map_gravity map_models maps models object_features objects planned_links planned_poses \
-    pose_covariances pose_operations pose_revisions pose_sources queries recording_findings recordings \
-    refined_points refinements keyframe_objects category_counts recording_summary covisible_objects \
+    pose_covariances pose_errors pose_operations pose_revisions pose_sources queries recording_findings \
+    recordings refined_points refinements keyframe_objects category_counts recording_summary covisible_objects \
     keypoint_counts keyframe_links keyframe_quality landmark_list landmark_relations_named \
-    landmark_visit_list; do
+    landmark_visit_list recording_pose_errors; do
     echo "GRANT CREATE, SELECT, SHOW VIEW ON \`semdb\`.\`$table\` TO 'semdb_reader'@'%';"
     echo "REVOKE CREATE ON \`semdb\`.\`$table\` FROM 'semdb_reader'@'%';"
   done

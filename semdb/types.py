@@ -241,6 +241,20 @@ class Candidate:
     inliers: int = 0  # 0 where it was not matched
 
 
+@dataclass(frozen=True, slots=True)
+class PoseErrors:
+    """How far the poses of a recording are off the images of its keyframes, along an axis.
+
+    The freedoms are how many numbers of keyframes' poses told: 0, nothing is known.
+    """
+
+    position_m: float
+    rotation_rad: float
+    position_freedom: float
+    rotation_freedom: float
+    keyframes: int = 0  # that were localized among the others
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Localization:
     """The answer to one query. `world_from_camera` and `covariance` are None when the verdict is `failed`.

@@ -26,6 +26,7 @@ RIGHTS: Mapping[str, str] = {
 VIEWS = (
     *("keyframe_objects", "category_counts", "recording_summary", "covisible_objects", "keypoint_counts"),
     *("keyframe_links", "keyframe_quality", "landmark_list", "landmark_relations_named", "landmark_visit_list"),
+    "recording_pose_errors",
 )
 READABLE = ("alembic_version", *sorted(set(metadata.tables) - set(HIDDEN)), *VIEWS)
 """What the reader may read: all but the tokens and jobs of the service."""

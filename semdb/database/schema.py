@@ -15,7 +15,22 @@ from semdb.database.tables import metadata
 from semdb.errors import SchemaError
 
 # Ascending; the last one is what this version of semdb reads and writes. A test compares them with the scripts.
-REVISIONS = ("0001", "0002", "0003", "0004", "0005", "0006", "0007", "0008", "0009", "0010", "0011", "0012", "0013")
+REVISIONS = (
+    "0001",
+    "0002",
+    "0003",
+    "0004",
+    "0005",
+    "0006",
+    "0007",
+    "0008",
+    "0009",
+    "0010",
+    "0011",
+    "0012",
+    "0013",
+    "0014",
+)
 HEAD = REVISIONS[-1]
 _NOT_ALLOWED = {1044, 1142, 1227}
 

@@ -187,6 +187,17 @@ recording_findings = _table(
     Column("message", LongText, nullable=False),
 )
 
+pose_errors = _table(
+    "pose_errors",
+    _ref("recording_id", "recordings.id", primary_key=True),
+    *(
+        Column(name, Double, nullable=False)
+        for name in ("position_m", "position_freedom", "rotation_rad", "rotation_freedom")
+    ),
+    Column("keyframes", Integer, nullable=False),
+    _time("measured_at"),
+)
+
 cameras = _table(
     "cameras",
     _id(),

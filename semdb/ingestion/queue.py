@@ -35,6 +35,7 @@ from semdb.ingestion.work import Item, work_off
 from semdb.perception.describe import Describer
 from semdb.perception.model_choice import ModelSpecs, settings_of_map, specs_for_ingest
 from semdb.recordings.base import Recording
+from semdb.refinement.error_step import measure_recording
 from semdb.settings import Settings
 
 CHUNK = 16  # keyframes of one message
@@ -174,6 +175,8 @@ class Workplace:
                 if outcome.left:
                     items.mark_sent(store.engine, recording_id, outcome.left, MESSAGE_WAIT_S)
                 outcome.complete = store.finish_recording(recording_id) == "complete"
+                if outcome.complete and outcome.stored:
+                    measure_recording(store, plan.map_id, recording_id)
             except NotFoundError:
                 outcome.gone = True  # deleted: there is nothing to do any more
         return outcome

@@ -12,14 +12,14 @@ Levenberg-Marquardt on the Schur complement, analytic Jacobians, a Cauchy loss o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from semdb.geometry import invert_pose, pose_distances
 from semdb.geometry.sensor import depth_noise
 from semdb.localization.sandwich import angle_between_views, cells_of, sandwich
-from semdb.types import Float32Array, FloatArray, IntArray
+from semdb.types import Float32Array, FloatArray, IntArray, PoseErrors
 
 CAUCHY_SQUARED = 4.0  # (2 sigma)^2: where the loss leaves the parabola
 QUERY = 0  # index of the query among the images
@@ -32,11 +32,6 @@ IGNORED = 1e6  # times the noise: no weight
 FIXED = 1e-7  # a standard deviation (m, rad) that nothing moves
 MOST_LOOSER = 3.0  # times the usual prior that a keyframe's own standard deviation makes of it, or a third
 LEAST_DISTANCE = 0.02  # of a keyframe from the query (`pose_distances`), for the prior on its pose
-RECORDED_POSITION, RECORDED_ROTATION = 1.05, 1.9  # fitted on freiburg1_rpy and the red kitchen
-USUAL_TURN, SEEN_TURN = (
-    0.0058,
-    0.0017,
-)  # rad: of recorded poses at a distance of 1, and what is no noise of its estimate
 MOST_EVIDENT = 10.0  # times the prior on a keyframe's pose that recorded poses may show to be off
 
 
@@ -94,7 +89,8 @@ class BundleResult:
     shift: FloatArray  # [c, 6] steps that the images have made from their start
     chi2: FloatArray  # [k] squared pixel residual over its variance
     iterations: int
-    recorded_sigma: tuple[float, float] = (0.0, 0.0)  # m and rad: see `_recorded_sigma`
+    evident: PoseErrors | None = None  # how far the keyframes' poses are off the images; None of a rough solution
+    nearest: tuple[float, float] = (0.0, 0.0)  # how far the nearest keyframe is, for its place and for its turn
 
 
 @dataclass(slots=True)
@@ -290,22 +286,18 @@ def adjust(
     if rough:
         return _result(state, blocks, iterations, None)
     solver.believe_depth(state)
-    sigma = _evident_sigma(solver, state, blocks, least, greatest)
-    recorded = _recorded_sigma(solver, state, blocks, sigma, least, greatest)
+    sigma, freedom = _evident_sigma(solver, state, blocks, least, greatest)
+    evident = _evident_errors(solver, state, blocks, sigma, freedom, least, greatest)
     solver.believe(sigma)
     state, blocks, more = solver.minimise(state, max_iterations)
     shown = 1 - (least / np.maximum(sigma, FIXED)) ** 2  # what is least is not known to be there at all
     covariance = _covariance(solver, blocks, state.poses[QUERY], np.tile(np.repeat(shown, 3), count))
-    return _result(state, blocks, iterations + more, covariance, recorded)
+    found = _result(state, blocks, iterations + more, covariance)
+    place, turn = solver.apart.min(axis=0)
+    return replace(found, evident=evident, nearest=(float(place), float(turn)))
 
 
-def _result(
-    state: _State,
-    blocks: _Blocks,
-    iterations: int,
-    covariance: FloatArray | None,
-    recorded: tuple[float, float] = (0.0, 0.0),
-) -> BundleResult:
+def _result(state: _State, blocks: _Blocks, iterations: int, covariance: FloatArray | None) -> BundleResult:
     return BundleResult(
         camera_from_world=state.poses[QUERY],
         points=state.points,
@@ -315,35 +307,38 @@ def _result(
         shift=state.shift,
         chi2=blocks.chi2,
         iterations=iterations,
-        recorded_sigma=recorded,
     )
 
 
-def _recorded_sigma(
-    solver: _Solver, state: _State, blocks: _Blocks, sigma: FloatArray, least: FloatArray, greatest: FloatArray
-) -> tuple[float, float]:
-    """How far (m, rad) a pose that was recorded where the query is would be off what the images show.
+def _evident_errors(
+    solver: _Solver,
+    state: _State,
+    blocks: _Blocks,
+    sigma: FloatArray,
+    freedom: FloatArray,
+    least: FloatArray,
+    greatest: FloatArray,
+) -> PoseErrors:
+    """How far the keyframes' recorded poses are off each other's images, over the distances that they have here.
 
-    Keyframes are off each other's images by so much for every unit of distance; what the nearest is away, it is off.
-    `sigma` is what was found of it where no more than `greatest` is believed.
+    `sigma` is what was found of it for a distance of 1, of `freedom` numbers, with no more than `greatest` believed.
     """
-    evident = sigma
     if (sigma[:2] >= greatest[:2]).any() and (greatest[:2] > least[:2]).all():
-        evident = _evident_sigma(solver, state, blocks, least, greatest * [MOST_EVIDENT, MOST_EVIDENT, 1.0])
-    shown = np.sqrt(np.maximum(evident[:2] ** 2 - least[:2] ** 2, 0.0))
-    # a few keyframes tell little of how they turned: in part it is what recordings show on the whole, if it is there
-    doubt = 0.5 * shown[1] ** 2 / (shown[1] ** 2 + SEEN_TURN**2)
-    shown[1] *= (USUAL_TURN / max(shown[1], FIXED)) ** doubt
-    metres, radians = shown * solver.apart.min(axis=0) * [RECORDED_POSITION, RECORDED_ROTATION]
-    return float(metres), float(radians)
+        wide = greatest * [MOST_EVIDENT, MOST_EVIDENT, 1.0]
+        sigma, freedom = _evident_sigma(solver, state, blocks, least, wide)
+    pairs = np.bincount(solver.problem.observed_image, minlength=solver.images)[1:]
+    far = np.average(solver.apart, axis=0, weights=np.maximum(pairs, 1e-9))
+    metres, radians = np.sqrt(np.maximum(sigma[:2] ** 2 - least[:2] ** 2, 0.0) * far)
+    return PoseErrors(float(metres), float(radians), float(freedom[0]), float(freedom[1]))
 
 
 def _evident_sigma(
     solver: _Solver, state: _State, blocks: _Blocks, least: FloatArray, greatest: FloatArray
-) -> FloatArray:
+) -> tuple[FloatArray, FloatArray]:
     """Standard deviation ``[3]`` of the keyframes' shifts, of their rotations and of all turns, from a solution.
 
-    Those of a keyframe at a distance of 1. The sum of their squares over how many of them the images, not the priors,
+    And of how many numbers each is: what the images determine where so much is believed.
+    They are of a keyframe at a distance of 1: the sum of squares over how many of them the images, not the priors,
     determine; iterated on the equations of the solution, which are those of the priors `greatest`.
     """
     reduced, gradient = solver.reduced(blocks, 0.0)
@@ -353,7 +348,7 @@ def _evident_sigma(
     pull = data @ offset - (gradient - old * offset)
     kinds = np.tile(np.repeat(np.arange(3), 3), solver.images)
     groups = [np.flatnonzero((kinds == kind) & (old > 0)) for kind in range(3)]
-    sigma = greatest
+    sigma, freedom = greatest, np.zeros(3)
     for _ in range(EVIDENCE_ROUNDS):
         information = solver.information_of(sigma).reshape(-1)
         inverse = np.linalg.inv(data + np.diag(information))
@@ -361,12 +356,13 @@ def _evident_sigma(
         found = np.empty(3)
         for kind, members in enumerate(groups):
             determined = float((1 - variance[members] * information[members]).sum())
+            freedom[kind] = freedom[kind] or determined
             found[kind] = np.sqrt(((mean[members] / drift[members]) ** 2).sum() / max(determined, 1e-6))
         found = np.clip(found, least, greatest)
         if np.abs(found - sigma).max() < 0.05 * float(np.abs(sigma).max()):
-            return found
+            return found, freedom
         sigma = found
-    return sigma
+    return sigma, freedom
 
 
 def _covariance(solver: _Solver, blocks: _Blocks, camera_from_world: FloatArray, shown: FloatArray) -> FloatArray:

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semdb.database.links import load_covariances
+from semdb.database.pose_errors import load_pose_errors
 from semdb.database.records import StoredKeyframe
 from semdb.database.refinements import POINTS
 from semdb.database.store import Store
@@ -27,7 +28,7 @@ from semdb.localization.shape_cache import Local, ShapeCache, There, edge_cache,
 from semdb.localization.surface_alignment import PlacedSurfaces
 from semdb.localization.views import ClassNumbers, KeyframeView, make_keyframe_view
 from semdb.recordings.images import decode_color_grey, has_size
-from semdb.types import Float32Array, FloatArray, ImageArray, Keypoints
+from semdb.types import Float32Array, FloatArray, ImageArray, Keypoints, PoseErrors
 
 FAR_SHAPES = 12.0  # of `pose_distances`: keyframes further off show nothing that a query could lie on
 USED, STALE, NONE, OFF = "used", "stale", "none", "off"  # what becomes of its points
@@ -59,6 +60,7 @@ class KeyframeCache:
         self._landmarks_read = False
         self._refined = refined
         self._points: str | None = None if refined else OFF
+        self._pose_errors: dict[int, PoseErrors] | None = None  # by recording
         self.left_out: dict[int, CodecError] = {}  # keyframes that cannot be used
 
     @property
@@ -80,6 +82,7 @@ class KeyframeCache:
             if self._points == USED:
                 self._views.clear()  # their points belong to the map as it was
             self._points = None
+        self._pose_errors = None
         self._landmarks, self._landmarks_read = None, False
         gone = None if change.everything else change.added | change.gone
         for shapes in (self._surfaces, self._edges):
@@ -127,7 +130,7 @@ class KeyframeCache:
             with self._turn:
                 view = self._others.placed(own.keyframe_id, own.world_from_camera)
             if view is not None:
-                found.append(replace(view, pose_sigma=own.pose_sigma))
+                found.append(replace(view, pose_sigma=own.pose_sigma, pose_errors=own.pose_errors))
         return found
 
     def _load(self, missing: Sequence[int]) -> None:
@@ -152,7 +155,17 @@ class KeyframeCache:
                 self._grey(stored),
                 looser,
                 sure.get(stored.id),
+                self._errors_of(stored.recording_id),
             )
+
+    def _errors_of(self, recording_id: int) -> PoseErrors | None:
+        if self._pose_errors is None:
+            self._pose_errors = load_pose_errors(self.store.engine, self._map_id, lambda _, error: self._say(error))
+        return self._pose_errors.get(recording_id)
+
+    def _say(self, error: CodecError) -> None:
+        if self.store.say is not None:
+            self.store.say(f"how far recorded poses are off is left out, run semdb refine --force: {error}")
 
     def _stored(self, keyframe_ids: Sequence[int]) -> list[StoredKeyframe]:
         try:

@@ -12,14 +12,15 @@ import poselib
 from semdb.geometry import invert_pose, pose_error, transform_points
 from semdb.localization.adjustment import bundle_adjust, in_front, project_adjusted, projected_error_px
 from semdb.localization.alignment import Alignment, align_pairs
-from semdb.localization.bundle import BundleResult
+from semdb.localization.bundle import QUERY, BundleResult
 from semdb.localization.learned_matching import KeypointMatcher, match_by
 from semdb.localization.matching import Matches, MatchingOptions, match_keypoints
 from semdb.localization.pairs import Pairs, guided_pairs, join_pairs, reprojection_px, world_points_of
 from semdb.localization.pose_options import PoseOptions
+from semdb.localization.recorded_errors import at_query, recorded_sigma, shrunk, weighted
 from semdb.localization.views import KeyframeView, View
 from semdb.threads import each
-from semdb.types import BoolArray, ConsistentPose, FloatArray, IntArray
+from semdb.types import BoolArray, ConsistentPose, FloatArray, IntArray, PoseErrors
 
 MINIMUM_PAIRS = 6  # below, a pose from 3 points has nothing to be checked with
 RIVAL_SHARE = 0.2  # of the first inliers with the best keyframe: a rival with fewer says nothing and may be missed
@@ -82,6 +83,7 @@ class PoseEstimate:
     spread: float  # 0..1: share of a 4x4 grid over the image that holds inliers
     aligned: int = 0  # pairs whose patches are alike to a fraction of a pixel; 0 without images
     recorded_sigma: tuple[float, float] = (0.0, 0.0)  # m and rad that poses recorded here are off, beyond `covariance`
+    evident: PoseErrors | None = None  # what this query shows of how far the poses of keyframes are off
     seen: Alignment | None = None  # where the query shows `pairs`, to a fraction of a pixel where patches were aligned
 
 
@@ -200,8 +202,20 @@ def estimate_pose(
         return None
     keep = error < options.inlier_px
     aligned = int(np.count_nonzero(seen.found))
-    recorded = refined.recorded_sigma
-    return replace(estimate, aligned=aligned, recorded_sigma=recorded, seen=Alignment(seen.xy[keep], seen.found[keep]))
+    alignment = Alignment(seen.xy[keep], seen.found[keep])
+    found = replace(estimate, aligned=aligned, evident=refined.evident, seen=alignment)
+    return replace(found, recorded_sigma=_recorded_sigma(found, keyframes, refined))
+
+
+def _recorded_sigma(
+    estimate: PoseEstimate, keyframes: Sequence[KeyframeView], refined: BundleResult
+) -> tuple[float, float]:
+    """See `recorded_errors`: by what this query shows, what its keyframes' recordings do, and what is usual."""
+    if refined.evident is None or estimate.covariance is None:
+        return 0.0, 0.0
+    known = weighted([keyframe.pose_errors for keyframe in keyframes], estimate.per_keyframe)
+    query = at_query(estimate.covariance, refined.nearest, refined.turn[QUERY])
+    return recorded_sigma(shrunk(refined.evident, known), query)
 
 
 def recorded_covariance(estimate: PoseEstimate) -> FloatArray | None:

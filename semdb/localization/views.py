@@ -12,7 +12,7 @@ import numpy.typing as npt
 from semdb.byte_descriptors import to_bytes
 from semdb.geometry import invert_pose, pixels_to_normalized, transform_points
 from semdb.localization.matching import BACKGROUND
-from semdb.types import Camera, Float32Array, FloatArray, ImageArray, IntArray, Keypoints
+from semdb.types import Camera, Float32Array, FloatArray, ImageArray, IntArray, Keypoints, PoseErrors
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,6 +59,7 @@ class KeyframeView:
     camera_from_world: FloatArray
     world_points: FloatArray  # [n, 3]
     pose_sigma: tuple[float, float] | None = None  # how sure the pose is, along an axis: metres, radians
+    pose_errors: PoseErrors | None = None  # how far the poses of its recording are off its images, where measured
 
 
 def in_kind_of(keyframes: Sequence[KeyframeView], query: View) -> View:
@@ -124,6 +125,7 @@ def make_keyframe_view(
     grey: ImageArray | None = None,
     looser: Float32Array | None = None,
     covariance: FloatArray | None = None,
+    pose_errors: PoseErrors | None = None,
 ) -> KeyframeView:
     """The view of a stored keyframe, with its points moved to the world; `covariance` ``[6, 6]`` is of its pose."""
     view = make_view(camera, keypoints, object_categories, numbers, with_points_only=True, grey=grey, looser=looser)
@@ -134,6 +136,7 @@ def make_keyframe_view(
         camera_from_world=invert_pose(world_from_camera),
         world_points=transform_points(world_from_camera, view.points),
         pose_sigma=None if covariance is None else _sigma_of(covariance),
+        pose_errors=pose_errors,
     )
 
 

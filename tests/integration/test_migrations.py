@@ -18,12 +18,14 @@ from semdb.database import schema, tokens
 from semdb.database.engine import make_engine
 from semdb.database.landmark_rows import load_gravity
 from semdb.database.links import list_links
+from semdb.database.pose_errors import load_pose_errors, replace_pose_errors
 from semdb.database.pose_records import PoseSource, World
 from semdb.database.pose_sources import recording_poses
 from semdb.database.records import ChangeKind
 from semdb.database.store import Store, open_store
 from semdb.database.tables import metadata
 from semdb.errors import SchemaError
+from semdb.types import PoseErrors
 from tests.database_samples import description, fill, stored_landmarks
 from tests.integration.comparison import FRAMES, assert_same
 
@@ -38,6 +40,7 @@ VIEWS = {
     "landmark_list",
     "landmark_relations_named",
     "landmark_visit_list",
+    "recording_pose_errors",
 }
 
 
@@ -219,6 +222,28 @@ def test_keyframes_of_before_have_no_quality(engine: Engine, empty_url: str) -> 
         connection.execute(text(f"INSERT INTO keyframe_qualities ({columns}) VALUES ({ids[0]}, 20, 0.5, 0.4, 0, 0)"))
         row = connection.execute(text("SELECT * FROM keyframe_quality")).one()._mapping
         assert (row["keyframe_id"], row["contrast"], row["keypoints"] > 0) == (ids[0], 0.4, True)
+
+
+def test_recordings_of_before_have_no_measured_errors(engine: Engine, empty_url: str) -> None:
+    schema.upgrade(engine)
+    with open_store(empty_url) as store:
+        map_id, recording_id, ids = fill(store)
+    schema.downgrade(engine, "0013")
+    assert "pose_errors" not in inspect(engine).get_table_names()
+    schema.upgrade(engine)
+    with open_store(empty_url) as store:
+        assert len(store.load_keyframes(ids)) == len(ids)
+        assert load_pose_errors(engine, map_id) == {}
+        errors = PoseErrors(0.008, 0.005, 90.0, 60.0, 12)
+        with engine.begin() as connection:
+            assert replace_pose_errors(connection, map_id, {recording_id: errors}) == 1
+        assert load_pose_errors(engine, map_id) == {recording_id: errors}
+        with engine.connect() as connection:
+            row = connection.execute(text("SELECT * FROM recording_pose_errors")).one()._mapping
+        assert (row["position_mm"], row["keyframes"]) == (pytest.approx(8.0), 12)
+        assert row["rotation_deg"] == pytest.approx(0.2865, abs=1e-4)
+        store.delete_recording(recording_id)
+        assert load_pose_errors(engine, map_id) == {}
 
 
 def test_a_database_of_before_gets_tokens(engine: Engine, empty_url: str) -> None:

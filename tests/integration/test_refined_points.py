@@ -14,6 +14,7 @@ from semdb.cli.status import refinements_of
 from semdb.database import point_rows
 from semdb.database.codecs import encode_array
 from semdb.database.left_out import LeftOut
+from semdb.database.pose_errors import POSE_ERRORS, load_pose_errors
 from semdb.database.records import KeyframePoints, KeyframeRecord, MapInfo
 from semdb.database.refinements import POINTS
 from semdb.database.store import Store, open_store
@@ -22,6 +23,7 @@ from semdb.geometry import pose_from, so3_exp
 from semdb.localization.images import make_localizer
 from semdb.localization.keyframe_cache import KeyframeCache
 from semdb.localization.localizer import LocalizerOptions
+from semdb.refinement import error_step
 from semdb.refinement.run import refine_map
 from semdb.types import Description, FloatArray, Keypoints
 from tests.database_samples import MODELS, description, plan, record
@@ -31,7 +33,7 @@ FRAMES = 6
 CATEGORIES = ["chair", "cup", "tv"]
 
 
-STEPS = ("classes", "points", "landmarks")
+STEPS = ("classes", "points", "errors", "landmarks")
 
 
 def pose_of(frame: float) -> FloatArray:
@@ -168,6 +170,53 @@ def test_stale_points_are_not_used(store: Store, views: tuple[list[KeyframeRecor
     store.delete_map(info.id)
     with store.engine.connect() as connection:
         assert connection.execute(text("SELECT COUNT(*) FROM refined_points")).scalar_one() == 0
+
+
+def test_errors_of_recorded_poses_are_measured(store: Store, views: tuple[list[KeyframeRecord], ...]) -> None:
+    records, _, query = views
+    random = np.random.default_rng(3)
+    off = [replace(one, world_from_camera=one.world_from_camera.copy()) for one in records]
+    for one in off:
+        one.world_from_camera[:3, 3] += random.normal(size=3) * 0.02
+    found = {}
+    for name, rows in (("exact", records), ("off", off)):
+        info, recording_id = ingest(store, name, rows, range(FRAMES))
+        before = make_localizer(store, info, "sql").localize(query)
+        (result,) = refine_map(store, info, kinds=[POSE_ERRORS])
+        assert (result.rows, result.current) == (1, True)
+        after = make_localizer(store, info, "sql").localize(query)
+        np.testing.assert_array_equal(after.world_from_camera, before.world_from_camera)  # to the bit
+        assert (after.verdict, after.confidence) == (before.verdict, before.confidence)
+        errors = load_pose_errors(store.engine, info.id)[recording_id]
+        assert errors.keyframes >= 4
+        assert errors.position_freedom > 20
+        found[name] = errors, before.covariance, after.covariance
+    assert found["exact"][0].position_m < 0.002
+    assert 0.008 < found["off"][0].position_m < 0.06
+    # what is known of a recording counts for more than what is usual
+    (_, first, exact), (_, _, far) = found["exact"], found["off"]
+    assert exact[0, 0] < first[0, 0] < far[0, 0]
+
+
+def test_few_or_damaged_keyframes_are_not_measured_at_ingest(
+    store: Store, views: tuple[list[KeyframeRecord], ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    info, recording_id = ingest(store, "room", views[0], range(FRAMES))
+    error_step.measure_recording(store, info.id, recording_id)
+    assert load_pose_errors(store.engine, info.id) == {}
+    monkeypatch.setattr(error_step, "FIRST_LEAST", FRAMES)
+    for _ in range(2):  # the second time in place of the first
+        error_step.measure_recording(store, info.id, recording_id)
+    first = load_pose_errors(store.engine, info.id)
+    assert first[recording_id].keyframes >= 4
+    with store.engine.begin() as connection:
+        connection.execute(text("UPDATE pose_errors SET position_m = -1"))
+    said: list[str] = []
+    with pytest.raises(CodecError, match=r"pose_errors\.position_m"):
+        load_pose_errors(store.engine, info.id)
+    listening = Store(store.engine, said.append)
+    assert make_localizer(listening, info, "sql").localize(views[2]).verdict == "localized"
+    assert any("semdb refine --force" in line for line in said)
 
 
 def test_rows_that_cannot_be_right_are_refused(store: Store, views: tuple[list[KeyframeRecord], ...]) -> None:

@@ -239,7 +239,9 @@ def test_how_far_recorded_poses_are_off_is_read_off_the_keyframes() -> None:
         found = []
         for seed in range(6):
             problem, truth = problem_of(seed, keyframes=6, keyframe_error=error, pixel_noise=0.4)
-            found.append(adjust(problem, moved_a_little(truth)).recorded_sigma[0])
+            shown = adjust(problem, moved_a_little(truth)).evident
+            assert shown is not None
+            found.append(shown.position_m)
         return found
 
     exact, off, far_off = shown(0.0), shown(0.012), shown(0.036)

@@ -1,0 +1,143 @@
+"""Step ``errors``: how far the recorded poses of each recording are off its images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from sqlalchemy import Connection
+
+from semdb.database.pose_errors import POSE_ERRORS, keyframes_of, replace_pose_errors, write_pose_errors
+from semdb.database.store import Store
+from semdb.errors import CodecError, NotFoundError
+from semdb.types import PoseErrors
+
+if TYPE_CHECKING:
+    from semdb.localization.keyframe_cache import KeyframeCache
+
+REVISION = 1  # of the computation: another one makes what is stored out of date
+FIRST_LEAST, FIRST_MOST = 8, 12  # keyframes that are measured when a recording of so many at least is ingested
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorOptions:
+    """Keyframes are localized among their neighbours of the same recording, without their own depth."""
+
+    most: int = 24  # that are localized of a recording, evenly over it
+    neighbours: int = 5
+    farthest: float = 6.0  # of `pose_distances`: further off nothing is seen in common
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorStep:
+    """How far the recorded poses of each recording are off its images."""
+
+    options: ErrorOptions = field(default_factory=ErrorOptions)
+    kind: str = POSE_ERRORS
+    summary: str = "errors of recorded poses"
+    by_default: bool = True
+    moves: bool = False
+
+    @property
+    def parameters(self) -> Mapping[str, Any]:
+        return {"revision": REVISION, **asdict(self.options)}
+
+    def compute(self, store: Store, map_id: int, progress: Callable[[int, int], None]) -> dict[int, PoseErrors]:
+        recordings = keyframes_of(store.engine, map_id)
+        total, done, found = sum(min(len(ids), self.options.most) for ids in recordings.values()), 0, {}
+        for key, ids in recordings.items():
+
+            def show(count: int, before: int = done) -> None:
+                progress(before + count, total)
+
+            errors = errors_of(store, map_id, ids, self.options, show)
+            done += min(len(ids), self.options.most)
+            if errors is not None:
+                found[key] = errors
+        return found
+
+    def write(self, connection: Connection, map_id: int, result: Mapping[int, PoseErrors]) -> int:
+        return replace_pose_errors(connection, map_id, result)
+
+
+def measure_recording(store: Store, map_id: int, recording_id: int) -> None:
+    """Measures and writes how far the poses of one recording are off, once it is ingested; nothing of few keyframes.
+
+    What the keyframes show that are there: nothing is missing without it, so damaged rows are no reason to fail.
+    """
+    ids = keyframes_of(store.engine, map_id, recording_id).get(recording_id, [])
+    options = ErrorOptions(most=FIRST_MOST)
+    if len(ids) < FIRST_LEAST:
+        return
+    try:
+        errors = errors_of(store, map_id, ids, options)
+    except (CodecError, NotFoundError) as error:
+        if store.say is not None:
+            store.say(f"how far the recorded poses are off is not known, semdb refine finds it: {error}")
+        return
+    if errors is not None:
+        write_pose_errors(store.engine, recording_id, errors)
+
+
+def errors_of(
+    store: Store,
+    map_id: int,
+    ids: Sequence[int],
+    options: ErrorOptions,
+    progress: Callable[[int], None] | None = None,
+) -> PoseErrors | None:
+    """What the keyframes `ids` of one recording, in the order of their frames, show; None where they show nothing.
+
+    Raises NotFoundError where a keyframe is deleted meanwhile, CodecError.
+    """
+    from semdb.localization.keyframe_cache import KeyframeCache
+    from semdb.localization.recorded_errors import pooled
+
+    cache, told = KeyframeCache(store, map_id), []
+    for count, keyframe_id in enumerate(spread_over(ids, options.most), start=1):
+        one = errors_at(cache, store, map_id, keyframe_id, ids, options)
+        told += [one] if one is not None else []
+        if progress is not None:
+            progress(count)
+    return pooled(told) if told else None
+
+
+def errors_at(
+    cache: KeyframeCache, store: Store, map_id: int, keyframe_id: int, ids: Sequence[int], options: ErrorOptions
+) -> PoseErrors | None:
+    """What one keyframe, localized among those of `ids` that are nearest, shows; None where it is not localized."""
+    from semdb.geometry import pose_distances
+    from semdb.localization.localizer import LocalizerOptions
+    from semdb.localization.pose import estimate_pose, first_pose, match_views
+    from semdb.localization.verdict import convinces
+
+    known, poses = cache.poses()
+    place = {key: n for n, key in enumerate(known)}
+    if keyframe_id not in place:
+        return None
+    others = [key for key in ids if key != keyframe_id and key in place]
+    if not others:
+        return None
+    distance = pose_distances(poses[place[keyframe_id]], poses[[place[key] for key in others]])
+    order = [int(n) for n in np.argsort(distance, kind="stable") if distance[n] < options.farthest]
+    own = cache.views([keyframe_id])
+    keyframes = cache.views([others[n] for n in order[: options.neighbours]])
+    if not own or not keyframes:
+        return None
+    settings = LocalizerOptions().for_models(store.map_models(map_id))
+    pose = replace(settings.pose, use_query_depth=False)
+    matches = match_views(own[0].view, keyframes, pose)
+    first = first_pose(own[0].view, keyframes, matches, pose)
+    if first is None or not convinces(first, settings.verdict):
+        return None
+    estimate = estimate_pose(own[0].view, keyframes, matches, pose, first)
+    return None if estimate is None else estimate.evident
+
+
+def spread_over(ids: Sequence[int], most: int) -> list[int]:
+    """At most so many of `ids`, evenly over them."""
+    if len(ids) <= most:
+        return list(ids)
+    return [ids[n] for n in np.linspace(0, len(ids) - 1, most).round().astype(int)]
