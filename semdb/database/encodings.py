@@ -6,7 +6,7 @@ anew answers from its old vectors until all new ones are there, and one transact
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -61,19 +61,18 @@ def _without(connection: Connection, map_id: int, model_id: int | None) -> list[
     return [int(key) for key in connection.execute(query.order_by(k.id)).scalars()]
 
 
-def image_kinds(engine: Engine, keyframe_ids: Sequence[int]) -> list[ImageKind]:
+def iter_image_kinds(engine: Engine, keyframe_ids: Sequence[int]) -> Iterator[ImageKind]:
     """What is stored of the images of keyframes, in the order of the ids; those that are gone are left out."""
     i, k = keyframe_images.c, keyframes.c
     head = func.substr(i.rgb, 1, HEAD).label("head")
     query = select(k.id, k.recording_id, k.frame_index, head).join(keyframe_images, i.keyframe_id == k.id)
-    found = {}
     for start in range(0, len(keyframe_ids), CHUNK):
-        some = query.where(k.id.in_(keyframe_ids[start : start + CHUNK]))
-        for row in retry.read(engine, partial(_rows, query=some)):
+        keys = keyframe_ids[start : start + CHUNK]
+        rows = {row.id: row for row in retry.read(engine, partial(_rows, query=query.where(k.id.in_(keys))))}
+        for row in (rows[key] for key in keys if key in rows):
             name = f"keyframe_images.rgb of keyframe {row.id}"
             frame_index = checked.integer(row.frame_index, f"keyframes.frame_index of keyframe {row.id}")
-            found[row.id] = ImageKind(row.id, row.recording_id, frame_index, checked.blob(row.head, name))
-    return [found[key] for key in keyframe_ids if key in found]
+            yield ImageKind(row.id, row.recording_id, frame_index, checked.blob(row.head, name))
 
 
 def _rows(connection: Connection, query: Select[Any]) -> list[Any]:

@@ -7,7 +7,7 @@ New vectors are written beside the old ones, which answer until all are there; t
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import cv2
@@ -16,7 +16,7 @@ from semdb.database.encodings import (
     add_vectors,
     drop_vectors,
     encoder_of,
-    image_kinds,
+    iter_image_kinds,
     keyframes_without,
     switch_encoder,
 )
@@ -31,7 +31,7 @@ from semdb.perception.encoders import load_encoder
 from semdb.perception.model_choice import spec_for_redescription
 from semdb.perception.protocols import BatchEncoder, Encoder
 from semdb.perception.quality import stretch_of, stretched
-from semdb.recordings.base import Recording
+from semdb.recordings.base import FrameEntry, Recording
 from semdb.recordings.images import decode_color
 from semdb.recordings.jpeg import JPEG_START, read_jpeg_header
 from semdb.recordings.png import ImageFileError
@@ -99,7 +99,7 @@ def redescribe_map(
     encoder = load_encoder(spec, own)
     known = encoder_of(store.engine, encoder.info, make=not dry_run)
     left = keyframes_without(store.engine, info.id, known)
-    sources = _Sources(store, settings, image_kinds(store.engine, left))
+    sources = _Sources(store, settings, left, progress, info.name)
     done = Redescribed(info.name, info.keyframes, len(left), sources.from_recordings, before, encoder.info)
     if dry_run or known is None:
         return done
@@ -113,7 +113,7 @@ def redescribe_map(
         if not switch_encoder(engine, info.id, known):
             drop_vectors(engine, info.id, [known], None if progress is None else partial(progress, "clearing old ones"))
             return Redescribed(info.name, info.keyframes, total, sources.from_recordings, before, encoder.info)
-        sources = _Sources(store, settings, image_kinds(engine, keyframes_without(engine, info.id, known)))
+        sources = _Sources(store, settings, keyframes_without(engine, info.id, known), progress, info.name)
     raise DatabaseError(
         f"keyframes came into the map {info.name!r} all the time: run it again when nothing is ingested"
     )
@@ -197,25 +197,34 @@ def _store(store: Store, target: tuple[int, int], some: _Some) -> _Some:
 class _Sources:
     """Where the image of each keyframe comes from."""
 
-    def __init__(self, store: Store, settings: Settings, kinds: Sequence[ImageKind]) -> None:
+    def __init__(
+        self, store: Store, settings: Settings, keyframe_ids: Sequence[int], progress: Progress | None, name: str
+    ) -> None:
         """Raises RecordingError where a recording is needed and not there."""
-        self.kinds = kinds
         self._store = store
         self._settings = settings
-        self._opened: dict[int, Recording] = {}
-        grey = [kind for kind in kinds if _is_grey(kind)]
-        self._grey = {kind.keyframe_id for kind in grey}
-        self.from_recordings = len(grey)
-        for recording_id in sorted({kind.recording_id for kind in grey}):
-            self._open(recording_id, [kind.frame_index for kind in grey if kind.recording_id == recording_id])
+        self._opened: dict[int, tuple[Recording, dict[int, FrameEntry]]] = {}
+        self.kinds: list[ImageKind] = []  # without their heads
+        self._grey: set[int] = set()
+        frames: dict[int, list[int]] = {}
+        for kind in iter_image_kinds(store.engine, keyframe_ids):
+            self.kinds.append(replace(kind, head=b""))
+            if _is_grey(kind):
+                self._grey.add(kind.keyframe_id)
+                frames.setdefault(kind.recording_id, []).append(kind.frame_index)
+            if progress is not None:
+                progress(f"looking at images of {name}", len(self.kinds), len(keyframe_ids))
+        self.from_recordings = len(self._grey)
+        for recording_id in sorted(frames):
+            self._open(recording_id, frames[recording_id])
 
     def image(self, kind: ImageKind) -> ImageArray:
         """RGB ``[H, W, 3]``. Raises NotFoundError, CodecError, FrameError."""
         if kind.keyframe_id not in self._grey:
             rgb = self._store.load_image(kind.keyframe_id).rgb
             return decode_color(rgb, f"keyframe_images.rgb of keyframe {kind.keyframe_id}")
-        recording = self._opened[kind.recording_id]
-        return recording.read_image(next(entry for entry in recording.entries if entry.index == kind.frame_index))
+        recording, entries = self._opened[kind.recording_id]
+        return recording.read_image(entries[kind.frame_index])
 
     def _open(self, recording_id: int, frames: Sequence[int]) -> None:
         plan = stored_plan(self._store.engine, recording_id)
@@ -223,11 +232,11 @@ class _Sources:
             recording = open_planned(self._store, plan, self._settings, "mount it where it was")
         except RecordingError as error:
             raise RecordingError(f"{error}; {GREY}") from error
-        there = {entry.index for entry in recording.entries}
-        missing = [index for index in frames if index not in there]
+        entries = {entry.index: entry for entry in recording.entries}
+        missing = [index for index in frames if index not in entries]
         if missing:
             raise RecordingError(f"{recording.path}: has no {few(missing)} any more; {GREY}")
-        self._opened[recording_id] = recording
+        self._opened[recording_id] = (recording, entries)
 
 
 def _is_grey(kind: ImageKind) -> bool:
