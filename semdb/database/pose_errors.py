@@ -69,6 +69,18 @@ def load_pose_errors(engine: Engine, map_id: int, bad: Bad | None = None) -> dic
     return found
 
 
+def map_of(engine: Engine, recording_id: int) -> int | None:
+    """The map of a recording; None where that is gone."""
+    query = select(recordings.c.map_id).where(recordings.c.id == recording_id)
+    return retry.read(engine, lambda connection: connection.execute(query).scalar())
+
+
+def is_measured(engine: Engine, recording_id: int) -> bool:
+    """Whether a recording has a row."""
+    query = select(pose_errors.c.recording_id).where(pose_errors.c.recording_id == recording_id)
+    return retry.read(engine, lambda connection: connection.execute(query).scalar() is not None)
+
+
 def keyframes_of(engine: Engine, map_id: int, recording_id: int | None = None) -> dict[int, list[int]]:
     """The keyframes of each recording of a map, or of one, by recording's id, in the order of their frames."""
 

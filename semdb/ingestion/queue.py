@@ -175,8 +175,8 @@ class Workplace:
                 if outcome.left:
                     items.mark_sent(store.engine, recording_id, outcome.left, MESSAGE_WAIT_S)
                 outcome.complete = store.finish_recording(recording_id) == "complete"
-                if outcome.complete and outcome.stored:
-                    measure_recording(store, plan.map_id, recording_id)
+                if outcome.complete:
+                    measure_recording(store, recording_id, changed=outcome.stored > 0)
             except NotFoundError:
                 outcome.gone = True  # deleted: there is nothing to do any more
         return outcome

@@ -276,8 +276,8 @@ def ingest_recording(
         if progress is not None and todo:
             progress(f"waiting for other processes at {recording.name}", max(0, todo - left), todo)
         time.sleep(SECONDS_BETWEEN_LOOKS)  # others are still at theirs, or have died: then their leases run out
-    if store.finish_recording(summary.recording_id) == "complete" and summary.stored:
-        measure_recording(store, store.find_map(summary.map_name).id, summary.recording_id)
+    if store.finish_recording(summary.recording_id) == "complete":
+        measure_recording(store, summary.recording_id, changed=summary.stored > 0)
     summary.failed = {item.frame_index: item.error for item in store.failed_items(summary.recording_id)}
     summary.elsewhere = max(0, todo - summary.stored - len(summary.failed))
     summary.seconds["total"] = time.perf_counter() - selected

@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from sqlalchemy import Connection
 
-from semdb.database.pose_errors import POSE_ERRORS, keyframes_of, replace_pose_errors, write_pose_errors
+from semdb.database.pose_errors import (
+    POSE_ERRORS,
+    is_measured,
+    keyframes_of,
+    map_of,
+    replace_pose_errors,
+    write_pose_errors,
+)
 from semdb.database.store import Store
 from semdb.errors import CodecError, NotFoundError
 from semdb.types import PoseErrors
@@ -62,11 +69,15 @@ class ErrorStep:
         return replace_pose_errors(connection, map_id, result)
 
 
-def measure_recording(store: Store, map_id: int, recording_id: int) -> None:
+def measure_recording(store: Store, recording_id: int, *, changed: bool) -> None:
     """Measures and writes how far the poses of one recording are off, once it is ingested; nothing of few keyframes.
 
-    What the keyframes show that are there: nothing is missing without it, so damaged rows are no reason to fail.
+    What is there already stays unless keyframes have `changed`; where it is missing, as after a process was killed, it
+    is made up for. Answers come without it, so damaged rows are no reason to fail.
     """
+    map_id = map_of(store.engine, recording_id)
+    if map_id is None or (not changed and is_measured(store.engine, recording_id)):
+        return
     ids = keyframes_of(store.engine, map_id, recording_id).get(recording_id, [])
     options = ErrorOptions(most=FIRST_MOST)
     if len(ids) < FIRST_LEAST:

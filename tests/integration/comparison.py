@@ -17,7 +17,7 @@ FRAMES = (0, 3, 7, 12, 20)
 # Rows that may stay when everything that was ingested is deleted, and the revision of the schema.
 REMAINING = {"maps", "models", "categories", "keyframe_changes", "alembic_version"}
 # What a second run of the same ingest may change: when it happened, and ids of rows that were rolled back.
-NOT_COMPARED = {"created_at", "finished_at", "changed_at", "lease_until", "worker", "attempts"}
+NOT_COMPARED = {"created_at", "finished_at", "changed_at", "measured_at", "lease_until", "worker", "attempts"}
 OF_A_KEYFRAME = (
     tables.keyframes,
     tables.keyframe_images,

@@ -202,11 +202,11 @@ def test_few_or_damaged_keyframes_are_not_measured_at_ingest(
     store: Store, views: tuple[list[KeyframeRecord], ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     info, recording_id = ingest(store, "room", views[0], range(FRAMES))
-    error_step.measure_recording(store, info.id, recording_id)
+    error_step.measure_recording(store, recording_id, changed=True)
     assert load_pose_errors(store.engine, info.id) == {}
     monkeypatch.setattr(error_step, "FIRST_LEAST", FRAMES)
-    for _ in range(2):  # the second time in place of the first
-        error_step.measure_recording(store, info.id, recording_id)
+    for changed in (False, False, True):  # the last time in place of the first
+        error_step.measure_recording(store, recording_id, changed=changed)
     first = load_pose_errors(store.engine, info.id)
     assert first[recording_id].keyframes >= 4
     with store.engine.begin() as connection:
