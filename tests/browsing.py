@@ -133,11 +133,11 @@ class Visit:
             "() => !document.querySelector('.spinner') && document.querySelector('main')?.children.length > 0"
         )
 
-    def shot(self, name: str) -> Path:
-        """Keeps a screenshot, to be looked at."""
+    def shot(self, name: str, what: str | None = None) -> Path:
+        """Keeps a screenshot, to be looked at, of the page or of what a selector names."""
         SCREENSHOTS.mkdir(exist_ok=True)
         path = SCREENSHOTS / f"{name}.png"
-        self.page.screenshot(path=str(path))
+        (self.page if what is None else self.page.locator(what)).screenshot(path=str(path))
         return path
 
     def theme(self, name: str) -> None:

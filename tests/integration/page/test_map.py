@@ -25,8 +25,8 @@ def test_from_a_card_to_a_map_to_a_thing_and_back(visit: Visit, world: World) ->
     expect(page.locator("h1")).to_have_text(HOSTILE)
     assert page.locator("main img[src=x]").count() == 0
     landmarks = world.database.landmarks(HOSTILE)
-    drawn = [len(world.database.keyframes(HOSTILE)), len(landmarks)]
-    assert viewer(page, "[viewer.scene.keyframes.length, viewer.scene.landmarks.length]") == drawn
+    expected = [len(world.database.keyframes(HOSTILE)), len(landmarks)]
+    assert viewer(page, "[viewer.scene.keyframes.length, viewer.scene.landmarks.length]") == expected
     assert viewer(page, "viewer.cloud.count") > 1000
     drawn(page)
     visit.shot(f"map-{world.name}")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import re
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, urlencode
@@ -22,7 +23,7 @@ from semdb.database import schema
 from semdb.database.engine import make_engine
 from semdb.database.store import open_store
 from semdb.service.settings import ServeSettings
-from semdb.types import Frame
+from semdb.types import Frame, InstanceMasks
 from tests.browsing import Visit, visiting
 from tests.integration.page.helpers import WORSE, World, drawn, dropped, photo_of, viewer
 from tests.integration.test_changes import stored
@@ -33,12 +34,14 @@ def place_of(page: Any) -> np.ndarray:
     return np.array([float(part) for part in page.inner_text(".facts dd >> nth=0").split(",")])
 
 
-def form_for(world: World, frame: Frame, **options: Any) -> tuple[dict[str, str], dict[str, Any]]:
-    """A frame as a form; without masks where the recording brings none."""
-    form, files = form_of(frame, **options)
-    if not world.needs_masks:
-        form.pop("categories", None)
-        files.pop("instances", None)
+def form_for(frame: Frame, **options: Any) -> tuple[dict[str, str], dict[str, Any]]:
+    """A frame as a form; without masks and time where its recording brings none."""
+    masks = frame.instances or InstanceMasks(np.zeros(frame.image.shape[:2], np.uint16), {})
+    form, files = form_of(replace(frame, instances=masks), **options)
+    if frame.instances is None:
+        del form["categories"], files["instances"]
+    if frame.timestamp_ns is None:
+        del form["timestamp_ns"]
     return form, files
 
 
@@ -84,7 +87,7 @@ def test_photos_that_are_dropped_anywhere_are_localized_and_drawn(visit: Visit, 
     page.wait_for_url("**view=top*")
     assert viewer(page, "viewer.mode") == "top"
     drawn(page)
-    page.locator(".space").screenshot(path=str(visit.shot("locate-above").with_name(f"locate-above-{world.name}.png")))
+    visit.shot(f"locate-above-{world.name}", ".space")
     page.go_back()
     page.wait_for_function("() => document.querySelector('.viewer').viewer.mode === '3d'")
     page.keyboard.press("j")
@@ -96,7 +99,7 @@ def test_photos_that_are_dropped_anywhere_are_localized_and_drawn(visit: Visit, 
 def test_the_log_is_filtered_and_each_query_shown(visit: Visit, world: World) -> None:
     names = ["shelf.png", WORSE]
     for frame, name in zip(world.photos[1:3], names, strict=True):
-        form, files = form_for(world, frame, name=name)
+        form, files = form_for(frame, name=name)
         assert world.served.client.post(world.api("localize"), data=form, files=files).status_code == 200
     page = visit.page
     visit.go(world.address("queries"))
@@ -178,8 +181,8 @@ def test_cameras_move_in_the_map(visit: Visit, world: World) -> None:
     client, positions = world.served.client, []
     session = client.post(world.api("sessions"), json={}).json()
     for k, frame in enumerate(world.photos[1:3]):
-        form, files = form_for(world, frame, depth=True)
-        answer = client.post(session["frames"], data=form, files=files)
+        form, files = form_for(frame, depth=True)
+        answer = client.post(session["frames"], data=form | {"time_s": str(k / 10)}, files=files)
         assert answer.json()["pose"] is not None, answer.text
         page.wait_for_selector(f"text={k + 1} frame")
         positions.append(viewer(page, "viewer.overlay.extras[0].places[0]"))
