@@ -27,7 +27,7 @@ from semdb.perception.protocols import FeatureExtractor
 from semdb.perception.quality import stretch_of, stretched
 from semdb.types import Description, Float32Array, FloatArray, ImageArray, Tolerance, Verdict
 
-CAPACITY = 128  # keyframes; about 0.6 MiB each
+CAPACITY = 128  # keyframes; about 0.7 MiB each
 BATCHES = (3, 7)  # keyframes that are asked, those with most pairs first
 
 
