@@ -112,7 +112,7 @@ def test_two_services_behind_tls(
 def serving(folder: Path, port: int) -> subprocess.Popen[bytes]:
     """A service as a process."""
     given = environment(
-        SEMDB_DATABASE_URL=f"sqlite:///{folder / 'a.sqlite3'}",
+        f"sqlite:///{folder / 'a.sqlite3'}",
         SEMDB_CACHE_DIR=str(folder / "cache"),
         SEMDB_SERVE_HOSTS="localhost",
         SEMDB_SERVE_SECRET=SECRET,

@@ -51,8 +51,8 @@ def test_the_reason_of_an_end_fits_whatever_a_map_is_called() -> None:
 
 def test_a_request_that_failed_ends_no_camera_but_its_own() -> None:
     async def both() -> int:
-        sessions = Sessions(4, 60.0)
-        async with sessions.use("one"):
+        sessions = Sessions(4, 4, 60.0)
+        async with sessions.use("one", "token 1"):
             sessions.end("one")
             sessions._live["one"] = Live()  # another request has begun it anew
         return len(sessions)
