@@ -93,7 +93,9 @@ def test_ten_thousand_keyframes_and_things_stay_usable(browser: Any, tmp_path: P
             visit.go("/maps/large")
             page.wait_for_function(READY)
 
+        before = time.process_time() + browser_cpu_ms() / 1000
         timed("map", open_map)
+        took["map, processor"] = time.process_time() + browser_cpu_ms() / 1000 - before  # of service and browser
         assert "10,000" in page.inner_text(".side-head")
         visit.shot("large")
         for view in ("locate", "queries", "live"):
@@ -119,7 +121,7 @@ def test_ten_thousand_keyframes_and_things_stay_usable(browser: Any, tmp_path: P
         timed("filter", lambda: page.fill(".panel-filter input", "cup"))
         timed("select", lambda: (page.locator(".list-row").first.click(), page.wait_for_selector(".detail h2")))
     print(took)
-    assert took["map"] < 30
+    assert took["map, processor"] < 30
     assert max(took[name] for name in ("locate", "queries", "live")) < 15
     assert took["frame, processor"] < 0.1
     assert max(took["filter"], took["select"]) < 5  # on a machine that does other things, too
