@@ -32,18 +32,18 @@ class ErrorModel:
 
     unit_m: float = 0.008
     unit_image_m: float = 0.008
-    place: float = 0.0062
-    place_errors: float = 2.5
+    place: float = 0.0064
+    place_errors: float = 2.8
     place_image: float = 0.87
     place_distance: float = 0.6
     place_near: float = 0.22
     unit_image_rad: float = 0.004
-    turn: float = 1.45
+    turn: float = 1.5
     turn_image: float = 0.8
     turn_distance: float = 0.71
     turn_near: float = 0.02
     clock_m: float = 0.038
-    clock_rad: float = 0.15
+    clock_rad: float = 0.16
     clock_of_m: float = 0.004  # of the recording's errors, from which on its clock is believed to differ
     clock_of_rad: float = 0.003
 
