@@ -53,6 +53,16 @@ def process(url: str, log: Path, *options: str, **settings: str) -> Iterator[tup
         found.wait(60)
 
 
+def wait_for(address: str) -> None:
+    """Until one of several processes answers: the address is said before they are there."""
+    for _ in range(600):
+        with contextlib.suppress(httpx.TransportError):
+            if httpx.get(f"{address}/health", timeout=30).status_code == 200:
+                return
+        time.sleep(0.1)
+    raise AssertionError(address)
+
+
 @pytest.fixture
 def file_url(tmp_path: Path) -> str:
     url = f"sqlite:///{tmp_path / 'a.sqlite3'}"
@@ -68,11 +78,7 @@ def test_two_processes_share_an_address(file_url: str, tmp_path: Path) -> None:
         process(file_url, log, "--workers", "2", SEMDB_LOG_FORMAT="json") as (running_one, address),
         httpx.Client(base_url=address, timeout=30) as client,
     ):
-        for _ in range(100):
-            with contextlib.suppress(httpx.TransportError):
-                if client.get("/health").status_code == 200:
-                    break
-            time.sleep(0.1)
+        wait_for(address)
         for number in range(20):
             with httpx.Client(base_url=address, timeout=30) as other:
                 answer = other.get("/v1/maps", headers={"X-Request-Id": f"mine-{number}"})
@@ -100,12 +106,13 @@ def test_two_processes_share_an_address(file_url: str, tmp_path: Path) -> None:
 @pytest.mark.long
 def test_cameras_are_tracked_by_two_processes(room: Path, frames: list[Frame], tmp_path: Path) -> None:
     url, cache = f"sqlite:///{tmp_path / 'a.sqlite3'}", str(tmp_path / "cache")
-    sent = [form_of(frame) for frame in frames[4:16]]
+    sent = [form_of(frame, depth=True) for frame in frames[4:16]]
     with opener(url, Path(cache)) as opening:
         opening().ingest(room, map="office", stride=4)
         tracker = opening().tracker("office")
         wanted = [tracker.update(frame, time_s=frame.timestamp_ns / 1e9) for frame in frames[4:16]]
     with process(url, tmp_path / "log", "--workers", "2", SEMDB_CACHE_DIR=cache) as (_, address):
+        wait_for(address)
         opened = httpx.post(f"{address}/v1/maps/office/sessions", json={}, timeout=120).json()
         # a connection that is kept stays with one process, whichever made the session
         with httpx.Client(base_url=address, timeout=120) as client:
