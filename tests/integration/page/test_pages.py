@@ -182,7 +182,7 @@ def test_cameras_move_in_the_map(visit: Visit, world: World) -> None:
     session = client.post(world.api("sessions"), json={}).json()
     for k, frame in enumerate(world.photos[1:3]):
         form, files = form_for(frame, depth=True)
-        answer = client.post(session["frames"], data=form | {"time_s": str(k / 10)}, files=files)
+        answer = client.post(session["frames"], data=form | {"time_s": str(20 * k)}, files=files)
         assert answer.json()["pose"] is not None, answer.text
         page.wait_for_selector(f"text={k + 1} frame")
         positions.append(viewer(page, "viewer.overlay.extras[0].places[0]"))
