@@ -32,8 +32,8 @@ class ErrorModel:
 
     unit_m: float = 0.008
     unit_image_m: float = 0.008
-    place: float = 0.008
-    place_errors: float = 3.2
+    place: float = 0.0066
+    place_errors: float = 3.0
     place_image: float = 0.87
     place_distance: float = 0.6
     place_near: float = 0.22
