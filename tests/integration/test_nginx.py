@@ -122,6 +122,12 @@ def serving(folder: Path, port: int) -> subprocess.Popen[bytes]:
     return subprocess.Popen(command, env=given, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
+def wait_for(port: int, token: str) -> None:
+    """Until a service answers."""
+    with semdb.connect(f"http://127.0.0.1:{port}", token=token, patience_s=120, retries=200) as db:
+        db.check()
+
+
 @pytest.mark.long
 def test_services_are_killed_under_load(
     room: Path,
@@ -154,8 +160,7 @@ def test_services_are_killed_under_load(
     try:
         with proxied(tmp_path, ports, certificate) as address:
             for port in ports:
-                with semdb.connect(f"http://127.0.0.1:{port}", token=token, patience_s=120, retries=200) as db:
-                    db.check()
+                wait_for(port, token)
             threads = [threading.Thread(target=load, args=(address,)) for _ in range(3)]
             for thread in threads:
                 thread.start()
@@ -164,6 +169,7 @@ def test_services_are_killed_under_load(
             goes_on()
             assert errors == []
             processes[0] = serving(tmp_path, ports[0])
+            wait_for(ports[0], token)
             goes_on()
             processes[1].terminate()
             goes_on()
