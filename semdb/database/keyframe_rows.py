@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,8 +14,14 @@ from semdb.database.codecs import decode_descriptors, decode_keypoints, keypoint
 from semdb.database.records import KeyframeHead, StoredKeyframe, StoredObject
 from semdb.database.tables import POSE_COLUMNS
 from semdb.errors import CodecError, UsageError
-from semdb.geometry import FARTHEST_POSE_M, pose_from, quat_wxyz_from_rotation, rotation_from_quat_wxyz
-from semdb.types import Camera, Float32Array, FloatArray, IntArray, ObjectGeometry
+from semdb.geometry import (
+    FARTHEST_POSE_M,
+    pose_from,
+    quat_wxyz_from_rotation,
+    rotation_from_quat_wxyz,
+    rotations_from_quats_wxyz,
+)
+from semdb.types import BoolArray, Camera, Float32Array, FloatArray, IntArray, ObjectGeometry
 
 MOST_OBJECTS = 10_000
 FARTHEST_POINT_M = 1e6  # of a 3D point from its camera
@@ -62,10 +68,10 @@ def keyframe_of(rows: KeyframeRows, key: int) -> StoredKeyframe:
     )
 
 
-def head_of(row: Any) -> KeyframeHead:
+def head_of(row: Any, known: Camera | None = None, pose: FloatArray | None = None) -> KeyframeHead:
     """A keyframe without what is large: the columns of `keyframes` and `cameras`, names of recording and map.
 
-    Raises CodecError.
+    Its camera and `pose` ``[4, 4]`` where they are known already. Raises CodecError.
     """
     where = f"keyframe {row.id}"
     time = row.timestamp_ns
@@ -76,9 +82,38 @@ def head_of(row: Any) -> KeyframeHead:
         recording=checked.text(row.recording, f"recordings.name of recording {row.recording_id}"),
         frame_index=checked.integer(row.frame_index, f"keyframes.frame_index of {where}"),
         timestamp_ns=None if time is None else checked.integer(time, f"keyframes.timestamp_ns of {where}", *limits),
-        camera=checked.camera(row, f"camera {row.camera_id} ({where})"),
-        world_from_camera=pose_of([getattr(row, name) for name in POSE_COLUMNS], where),
+        camera=checked.camera(row, f"camera {row.camera_id} ({where})") if known is None else known,
+        world_from_camera=pose_of([getattr(row, name) for name in POSE_COLUMNS], where) if pose is None else pose,
     )
+
+
+def heads_of(rows: Sequence[Any], damaged: Callable[[int, CodecError], None]) -> list[KeyframeHead]:
+    """`head_of` many rows, whose cameras are few; those that are damaged are told."""
+    numbers = [[getattr(row, name) for name in POSE_COLUMNS] for row in rows]
+    usable, matrices = usable_poses(numbers)
+    poses, cameras = dict(zip(np.flatnonzero(usable).tolist(), matrices, strict=True)), dict[int, Camera]()
+    found = []
+    for place, row in enumerate(rows):
+        try:
+            head = head_of(row, cameras.get(row.camera_id), poses.get(place))
+        except CodecError as error:
+            damaged(row.id, error)
+            continue
+        cameras.setdefault(row.camera_id, head.camera)
+        found.append(head)
+    return found
+
+
+def usable_poses(rows: Sequence[Sequence[Any]]) -> tuple[BoolArray, FloatArray]:
+    """Which rows of the columns `POSE_COLUMNS` are poses, ``[n]``, and these ``[m, 4, 4]``."""
+    numbers = checked.numbers_of(rows, len(POSE_COLUMNS))
+    usable = checked.are_poses(numbers)
+    numbers = numbers[usable]
+    matrices = np.zeros((len(numbers), 4, 4))
+    matrices[:, :3, :3] = rotations_from_quats_wxyz(numbers[:, :4])
+    matrices[:, :3, 3] = numbers[:, 4:]
+    matrices[:, 3, 3] = 1.0
+    return usable, matrices
 
 
 def pose_of(values: Sequence[Any], where: str) -> FloatArray:

@@ -12,7 +12,7 @@ from sqlalchemy.sql.elements import ColumnElement
 
 from semdb.database import checked, retry
 from semdb.database.codecs import decode_mask, decode_vectors
-from semdb.database.keyframe_rows import KeyframeRows, head_of, keyframe_of
+from semdb.database.keyframe_rows import KeyframeRows, heads_of, keyframe_of, usable_poses
 from semdb.database.records import KeyframeHead, StoredImage, StoredKeyframe
 from semdb.database.tables import (
     POSE_COLUMNS,
@@ -30,7 +30,6 @@ from semdb.database.tables import (
     recordings,
 )
 from semdb.errors import CodecError, NotFoundError
-from semdb.geometry import rotations_from_quats_wxyz
 from semdb.types import BoolArray, Float32Array, FloatArray
 
 CHUNK = 500
@@ -126,18 +125,12 @@ def poses(
         return list(_chunked(connection, _ints(keys), lambda chunk: query.where(k.id.in_(chunk))))
 
     rows = sorted(map(tuple, retry.read(engine, work)), key=lambda row: row[0])
-    numbers = checked.numbers_of([row[1:] for row in rows], len(POSE_COLUMNS))
-    usable = checked.are_poses(numbers)
+    usable, matrices = usable_poses([row[1:] for row in rows])
     for place in np.flatnonzero(~usable):
         try:
             checked.pose_numbers(rows[place][1:], f"keyframe {rows[place][0]}")
         except CodecError as error:
             _leave_out(bad, rows[place][0], error)
-    numbers = numbers[usable]
-    matrices = np.zeros((len(numbers), 4, 4))
-    matrices[:, :3, :3] = rotations_from_quats_wxyz(numbers[:, :4])
-    matrices[:, :3, 3] = numbers[:, 4:]
-    matrices[:, 3, 3] = 1.0
     return [rows[place][0] for place in np.flatnonzero(usable)], matrices
 
 
@@ -243,11 +236,7 @@ def keyframe_heads(
         rows = retry.read(engine, partial(page, start=after, size=wanted))
         if keys is not None:
             _missing(_ints(keys), {row.id for row in rows}, "keyframe")
-        for row in rows:
-            try:
-                found.append(head_of(row))
-            except CodecError as error:
-                _leave_out(bad, row.id, error)
+        found += heads_of(rows, partial(_leave_out, bad))
         if wanted is None or keys is not None or len(rows) < wanted or len(found) == limit:
             return found
         after = rows[-1].id  # damaged ones must not make a page look like the last
