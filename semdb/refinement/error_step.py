@@ -134,8 +134,12 @@ def errors_at(
     distance = pose_distances(poses[place[keyframe_id]], poses[[place[key] for key in others]])
     order = [int(n) for n in np.argsort(distance, kind="stable") if distance[n] < options.farthest]
     own = cache.views([keyframe_id])
-    keyframes = cache.views([others[n] for n in order[: options.neighbours]])
-    if not own or not keyframes:
+    near = cache.views([others[n] for n in order[: options.neighbours]])
+    if not own:
+        return None
+    width = own[0].view.descriptors.shape[1]  # rows of another one are damaged: the step of points says which
+    keyframes = [keyframe for keyframe in near if keyframe.view.descriptors.shape[1] == width]
+    if not keyframes:
         return None
     settings = LocalizerOptions().for_models(store.map_models(map_id))
     pose = replace(settings.pose, use_query_depth=False)
