@@ -80,7 +80,7 @@ class BlurredKeyframes:
         made = make_keyframe_view(
             known.keyframe_id, camera, known.world_from_camera, keypoints, (), self._numbers, grey
         )
-        return replace(made, pose_sigma=known.pose_sigma)
+        return replace(made, pose_sigma=known.pose_sigma, pose_errors=known.pose_errors)
 
     def _depth(self, known: KeyframeView) -> Float32Array | None:
         name = f"keyframe_images.depth of keyframe {known.keyframe_id}"

@@ -356,7 +356,7 @@ def _evident_sigma(
         found = np.empty(3)
         for kind, members in enumerate(groups):
             determined = float((1 - variance[members] * information[members]).sum())
-            freedom[kind] = freedom[kind] or determined
+            freedom[kind] = freedom[kind] or max(determined, 0.0)
             found[kind] = np.sqrt(((mean[members] / drift[members]) ** 2).sum() / max(determined, 1e-6))
         found = np.clip(found, least, greatest)
         if np.abs(found - sigma).max() < 0.05 * float(np.abs(sigma).max()):

@@ -51,6 +51,7 @@ class KeyframeCache:
         self._capacity = capacity
         self._views: OrderedDict[int, KeyframeView] = OrderedDict()
         self._names: dict[int, tuple[str, int]] = {}
+        self._recordings: dict[int, int] = {}  # by keyframe
         self._poses: tuple[list[int], FloatArray] | None = None
         self._stale: set[int] = set()  # keyframes whose poses are to be read again
         self._surfaces, self._edges = surface_cache(store), edge_cache(store)
@@ -92,6 +93,7 @@ class KeyframeCache:
         if change.everything:
             self._views.clear()
             self._names.clear()
+            self._recordings.clear()
             self.left_out.clear()
             self._poses = None
             return
@@ -99,6 +101,7 @@ class KeyframeCache:
             self.left_out.pop(keyframe_id, None)
             self._views.pop(keyframe_id, None)
             self._names.pop(keyframe_id, None)
+            self._recordings.pop(keyframe_id, None)
         if self._poses is not None:
             self._stale |= change.added | change.gone
 
@@ -116,7 +119,7 @@ class KeyframeCache:
                 view = self._views.get(keyframe_id)
                 if view is not None and self._is_comparable(view, descriptors):
                     self._views.move_to_end(keyframe_id)
-                    found.append(view)
+                    found.append(self._with_errors(view))
             while len(self._views) > self._capacity:
                 self._views.popitem(last=False)
             return found
@@ -140,6 +143,7 @@ class KeyframeCache:
         sure = load_covariances(self.store.engine, missing, self.store.left_out)
         for stored in self._stored(missing):
             self._names[stored.id] = (stored.recording, stored.frame_index)
+            self._recordings[stored.id] = stored.recording_id
             try:
                 keypoints, looser = with_refined(stored.keypoints, refined.get(stored.id), stored.id)
             except CodecError as error:
@@ -155,13 +159,16 @@ class KeyframeCache:
                 self._grey(stored),
                 looser,
                 sure.get(stored.id),
-                self._errors_of(stored.recording_id),
             )
 
-    def _errors_of(self, recording_id: int) -> PoseErrors | None:
+    def _with_errors(self, view: KeyframeView) -> KeyframeView:
+        """The same with what is known of its recording now, which may be measured after its keyframes were read."""
         if self._pose_errors is None:
             self._pose_errors = load_pose_errors(self.store.engine, self._map_id, lambda _, error: self._say(error))
-        return self._pose_errors.get(recording_id)
+        errors = self._pose_errors.get(self._recordings[view.keyframe_id])
+        if view.pose_errors != errors:
+            view = self._views[view.keyframe_id] = replace(view, pose_errors=errors)
+        return view
 
     def _say(self, error: CodecError) -> None:
         if self.store.say is not None:

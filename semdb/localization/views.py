@@ -125,7 +125,6 @@ def make_keyframe_view(
     grey: ImageArray | None = None,
     looser: Float32Array | None = None,
     covariance: FloatArray | None = None,
-    pose_errors: PoseErrors | None = None,
 ) -> KeyframeView:
     """The view of a stored keyframe, with its points moved to the world; `covariance` ``[6, 6]`` is of its pose."""
     view = make_view(camera, keypoints, object_categories, numbers, with_points_only=True, grey=grey, looser=looser)
@@ -136,7 +135,6 @@ def make_keyframe_view(
         camera_from_world=invert_pose(world_from_camera),
         world_points=transform_points(world_from_camera, view.points),
         pose_sigma=None if covariance is None else _sigma_of(covariance),
-        pose_errors=pose_errors,
     )
 
 

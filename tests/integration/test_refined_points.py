@@ -14,18 +14,19 @@ from semdb.cli.status import refinements_of
 from semdb.database import point_rows
 from semdb.database.codecs import encode_array
 from semdb.database.left_out import LeftOut
-from semdb.database.pose_errors import POSE_ERRORS, load_pose_errors
+from semdb.database.pose_errors import POSE_ERRORS, load_pose_errors, write_pose_errors
 from semdb.database.records import KeyframePoints, KeyframeRecord, MapInfo
 from semdb.database.refinements import POINTS
 from semdb.database.store import Store, open_store
 from semdb.errors import CodecError
 from semdb.geometry import pose_from, so3_exp
+from semdb.localization.coarse import MapChange
 from semdb.localization.images import make_localizer
 from semdb.localization.keyframe_cache import KeyframeCache
 from semdb.localization.localizer import LocalizerOptions
 from semdb.refinement import error_step
 from semdb.refinement.run import refine_map
-from semdb.types import Description, FloatArray, Keypoints
+from semdb.types import Description, FloatArray, Keypoints, PoseErrors
 from tests.database_samples import MODELS, description, plan, record
 from tests.unit.localization_scene import CAMERA, Scene
 
@@ -196,6 +197,19 @@ def test_errors_of_recorded_poses_are_measured(store: Store, views: tuple[list[K
     # what is known of a recording counts for more than what is usual
     (_, first, exact), (_, _, far) = found["exact"], found["off"]
     assert exact[0, 0] < first[0, 0] < far[0, 0]
+
+
+def test_an_open_map_takes_errors_that_are_measured_later(
+    store: Store, views: tuple[list[KeyframeRecord], ...]
+) -> None:
+    info, recording_id = ingest(store, "room", views[0], range(2))
+    cache, (ids, _) = KeyframeCache(store, info.id), store.poses(info.id)
+    assert [view.pose_errors for view in cache.views(ids)] == [None, None]
+    errors = PoseErrors(0.01, 0.005, 90.0, 60.0, 12)
+    write_pose_errors(store.engine, recording_id, errors)
+    assert [view.pose_errors for view in cache.views(ids)] == [None, None]
+    cache.forget(MapChange(added=frozenset([ids[-1] + 1])))
+    assert [view.pose_errors for view in cache.views(ids)] == [errors, errors]
 
 
 def test_few_or_damaged_keyframes_are_not_measured_at_ingest(
