@@ -17,6 +17,7 @@ from semdb.database import checked, retry, tables
 from semdb.database.copying_landmarks import copy_landmarks
 from semdb.database.ids import new_id
 from semdb.database.links import LARGEST_ID
+from semdb.database.reading import encoder_id
 from semdb.database.records import ChangeKind
 from semdb.database.refinements import map_state
 from semdb.database.statement import HIDDEN
@@ -57,8 +58,13 @@ class _Copy:
 
 
 def copy_map(source: Engine, map_id: int, target: Engine, name: str, *, progress: Progress | None = None) -> Copied:
-    """Copies a map into `target` under `name`, or goes on with it. Raises UsageError where another map has it."""
+    """Copies a map into `target` under `name`, or goes on with it.
+
+    Raises UsageError where another map has the name, DatabaseError where the map is described by another encoder
+    meanwhile: keyframes that were copied before have no vector of it.
+    """
     copy = _Copy(source, target, done=Copied(name))
+    encoder = _encoder(source, map_id)
     _copy_map_row(copy, map_id, name)
     total = _count(source, map_id)
     for row in _rows(source, select(tables.recordings).where(tables.recordings.c.map_id == map_id)):
@@ -67,12 +73,21 @@ def copy_map(source: Engine, map_id: int, target: Engine, name: str, *, progress
     for table in _hanging_from("maps"):
         if table.name not in ("recordings", *NOT_COPIED):
             _copy_rows(copy, table, "map_id", map_id)
+    if _encoder(source, map_id) != encoder:
+        raise DatabaseError(
+            f"the map {name!r} was described anew by another encoder while it was copied: remove the copy and start "
+            "again"
+        )
     used = select(tables.landmarks.c.category_id).where(tables.landmarks.c.map_id == map_id)
     names = _rows(source, select(tables.categories.c.id).where(tables.categories.c.id.in_(used)))
     known = retry.write(target, lambda connection: _categories(copy, connection, names))
     copy_landmarks(source, map_id, target, copy.ids["maps"][map_id], known)
     _keep_current(source, map_id, target, copy.ids["maps"][map_id])
     return copy.done
+
+
+def _encoder(source: Engine, map_id: int) -> int | None:
+    return retry.read(source, lambda connection: encoder_id(connection, map_id))
 
 
 def _keep_current(source: Engine, map_id: int, target: Engine, target_id: int) -> None:

@@ -17,6 +17,7 @@ from semdb.database import checked, retry
 from semdb.database.codecs import encode_array
 from semdb.database.engine import check_packet
 from semdb.database.ids import SharedIds, model_row
+from semdb.database.moving import say_held
 from semdb.database.reading import encoder_id
 from semdb.database.records import ChangeKind, ImageKind, ItemState
 from semdb.database.tables import (
@@ -135,7 +136,10 @@ def _switch(connection: Connection, map_id: int, model_id: int) -> int:
 
 
 def _hold(connection: Connection, map_id: int) -> None:
-    """Waits for those who store keyframes of a map, and makes others wait: they change the same rows first."""
+    """Waits for those who store keyframes of a map, and makes others wait: they change the same rows first.
+
+    On other nodes of a cluster, too, where only rows that are written anew are at odds.
+    """
     item, r = ingest_items.c, recordings.c
     own = select(r.id).where(r.map_id == map_id)
     connection.execute(update(ingest_items).where(item.recording_id.in_(own)).values(attempts=item.attempts))
@@ -147,6 +151,8 @@ def _hold(connection: Connection, map_id: int) -> None:
             f"the recording {name!r} is being ingested, so its map keeps its vectors for now: when that is done, run "
             "this again, which does what is left"
         )
+    for recording_id in list(connection.execute(own.order_by(r.id)).scalars()):
+        say_held(connection, recording_id)
 
 
 def drop_vectors(engine: Engine, map_id: int, keep: Sequence[int], progress: Progress | None = None) -> int:

@@ -128,13 +128,13 @@ def hold(connection: Connection, one: MovedRecording) -> None:
     running = select(func.count()).where(item.recording_id == one.recording_id, item.state == ItemState.RUNNING.value)
     if connection.execute(running).scalar():
         raise UsageError(f"the recording {row.name!r} is being ingested: run it again when that is done")
-    _say_held(connection, one.recording_id)
+    say_held(connection, one.recording_id)
     own = keyframes.c.recording_id == one.recording_id
     if _now(connection, own) != connection.execute(select(func.count()).where(own)).scalar():
         raise DatabaseError(_stored_meanwhile(row.name))
 
 
-def _say_held(connection: Connection, recording_id: int) -> None:
+def say_held(connection: Connection, recording_id: int) -> None:
     """Writes the rows anew, as they are, of what a recording has still to store.
 
     For the same reason as `say_moved`: whoever stores one of them on another node of a cluster, and this, have to write

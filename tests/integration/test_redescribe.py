@@ -22,9 +22,10 @@ from typer.testing import CliRunner
 import semdb
 from semdb.cli.main import app
 from semdb.database import encodings, retry, tables
+from semdb.database.copying import copy_map
 from semdb.database.records import ChangeKind, ItemState, MapInfo
 from semdb.database.store import Store, open_store
-from semdb.errors import ProvenanceError, RecordingError, UsageError
+from semdb.errors import DatabaseError, ProvenanceError, RecordingError, UsageError
 from semdb.ingestion import redescribe
 from semdb.ingestion.redescribe import redescribe_map
 from semdb.localization.index import IndexSource, MapIndex
@@ -280,6 +281,19 @@ def test_an_image_that_cannot_be_read_keeps_the_map_as_it_is(open_file_store: St
     store.delete_keyframes([ids[4]])
     assert redescribe_map(store, info, WANTED).described == 0
     assert vectors(store, info).shape == (9, 560)
+
+
+def test_a_copy_is_of_one_encoder(open_file_store: Store, tmp_path: Path) -> None:
+    info = filled(open_file_store)
+
+    def meanwhile(done: int, total: int) -> None:
+        redescribe_map(open_file_store, info, WANTED)
+
+    with open_store(f"sqlite:///{tmp_path / 'copy.sqlite3'}", create=True) as copy:
+        with pytest.raises(DatabaseError, match="'m' was described anew by another encoder while it was copied"):
+            copy_map(open_file_store.engine, info.id, copy.engine, "m", progress=meanwhile)
+        copied = copy_map(open_file_store.engine, info.id, copy.engine, "again")
+        assert (copied.keyframes, copied.skipped) == (10, 0)
 
 
 def test_an_empty_map_has_nothing_to_describe(open_file_store: Store) -> None:
