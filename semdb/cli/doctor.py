@@ -13,6 +13,7 @@ import typer
 
 from semdb.cli.options import JsonFlag, Overrides, settings_options
 from semdb.rights import folder_problem
+from semdb.shown import for_shell
 
 if TYPE_CHECKING:
     from sqlalchemy import Engine
@@ -150,7 +151,7 @@ def crops(engine: Engine) -> Iterator[Check]:
             yield Check("problem", f"map {head.name}", str(error))
             continue
         if found is not None:
-            advice = f"semdb ingest --redescribe encoder --map {head.name}"
+            advice = for_shell(["semdb", "ingest", "--redescribe", "encoder", "--map", head.name])
             yield Check(
                 "info", f"map {head.name}", f"made with the crop {found[0]}, new maps have {found[1]}: {advice}"
             )
