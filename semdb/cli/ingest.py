@@ -173,24 +173,33 @@ def _resume(settings: Settings, *, json: bool) -> None:
 
 
 def _redescribe(settings: Settings, what: str, map_name: str | None, *, dry_run: bool, json: bool) -> None:
-    """Describes one map anew, or all that hold keyframes, one after the other."""
+    """Describes one map anew, or all that hold keyframes, one after the other; one that cannot be is named."""
     from semdb.cli.output import print_json, print_lines
-    from semdb.cli.progress import StagedProgress
-    from semdb.errors import UsageError
+    from semdb.cli.progress import StagedProgress, say
+    from semdb.errors import DatabaseUnavailableError, SemdbError, UsageError
 
     if what != "encoder":
         raise UsageError(f"--redescribe {what}: what can be described anew is the encoder's vectors: encoder")
-    done = []
-    with StagedProgress() as progress, ends_when_told(), open_database(settings) as database:
+    done, failed = [], list[SemdbError]()
+    with ends_when_told(), open_database(settings) as database:
         names = (
             [database.map(map_name).name] if map_name is not None else [m.name for m in database.maps() if m.keyframes]
         )
         for name in names:
-            done.append(database.redescribe(name, dry_run=dry_run, progress=progress.update))
+            try:
+                with StagedProgress() as progress:
+                    done.append(database.redescribe(name, dry_run=dry_run, progress=progress.update))
+            except SemdbError as error:
+                if len(names) == 1 or isinstance(error, DatabaseUnavailableError):
+                    raise
+                failed.append(error)
+                say(f"{name}: not described anew: {error}")
     if json:
         print_json([redescribed_json(one, dry_run=dry_run) for one in done])
     else:
         print_lines(*(redescribed_text(one, dry_run=dry_run) for one in done))
+    if failed:
+        raise typer.Exit(failed[0].exit_code)
 
 
 def redescribed_json(done: Redescribed, *, dry_run: bool) -> dict[str, object]:

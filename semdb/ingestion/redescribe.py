@@ -105,14 +105,15 @@ def redescribe_map(
         return done
     engine, current = store.engine, store.encoder_id(info.id)
     drop_vectors(engine, info.id, [key for key in (known, current) if key is not None])
-    total, failed = 0, dict[int, str]()
+    total, brought, failed = 0, 0, dict[int, str]()
     for _ in range(ROUNDS):
         total += _describe(store, sources, encoder, (info.id, known), failed, progress, info.name)
+        brought += sources.from_recordings
         if failed:
             raise UsageError(_failed_text(info.name, failed))
         if not switch_encoder(engine, info.id, known):
             drop_vectors(engine, info.id, [known], None if progress is None else partial(progress, "clearing old ones"))
-            return Redescribed(info.name, info.keyframes, total, sources.from_recordings, before, encoder.info)
+            return Redescribed(info.name, info.keyframes, total, brought, before, encoder.info)
         sources = _Sources(store, settings, keyframes_without(engine, info.id, known), progress, info.name)
     raise DatabaseError(
         f"keyframes came into the map {info.name!r} all the time: run it again when nothing is ingested"

@@ -346,6 +346,22 @@ def test_images_that_were_not_kept_come_from_the_recording(
         assert db.localize(sorted((there / "rgb").iterdir())[0], like=str(there)).world_from_camera is not None
 
 
+def test_a_map_that_is_being_ingested_keeps_no_other_from_it(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'a.sqlite3'}"
+    with open_store(url, create=True) as store:
+        for name in ("busy", "free"):
+            planned = store.plan_recording(store.ensure_map(name), plan("visit", [0, 90]), MODELS)
+            store.write_keyframe(planned.recording_id, frame(0))
+        i = tables.ingest_items
+        running = update(i).where(i.c.recording_id == 1, i.c.frame_index == 90).values(state=ItemState.RUNNING.value)
+        retry.write(store.engine, lambda connection: connection.execute(running))
+    code, out, err = run(url, "--redescribe", "encoder", "--encoder", "gist", "--json")
+    assert code == 2
+    assert "busy: not described anew: the recording 'visit' is being ingested" in err
+    [done] = json.loads(out)
+    assert (done["map"], done["switched"]) == ("free", True)
+
+
 def test_what_makes_no_sense_is_said(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path / 'a.sqlite3'}"
     for arguments, wanted in (
