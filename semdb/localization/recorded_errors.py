@@ -31,6 +31,7 @@ class ErrorModel:
     """
 
     unit_m: float = 0.008
+    greatest_m: float = 0.016  # beyond, a place is off in proportion: recordings that it was fitted on have less
     unit_image_m: float = 0.008
     place: float = 0.0066
     place_errors: float = 3.0
@@ -102,7 +103,8 @@ def recorded_sigma(errors: PoseErrors, query: AtQuery, model: ErrorModel | None 
     """How far (m, rad; along an axis) a pose recorded where the query is would be off what the images show."""
     of = model or ErrorModel()
     place = np.hypot(query.nearest[0] ** of.place_distance, of.place_near) * of.place
-    place *= (errors.position_m / of.unit_m) ** of.place_errors * (query.position_m / of.unit_image_m) ** of.place_image
+    place *= (min(errors.position_m, of.greatest_m) / of.unit_m) ** of.place_errors
+    place *= max(errors.position_m / of.greatest_m, 1.0) * (query.position_m / of.unit_image_m) ** of.place_image
     turn = np.hypot(query.nearest[1] ** of.turn_distance, of.turn_near) * of.turn * errors.rotation_rad
     turn *= (query.rotation_rad / of.unit_image_rad) ** of.turn_image
     metres = of.clock_m * query.turn_rad * min(errors.position_m / of.clock_of_m, 1.0) ** 2

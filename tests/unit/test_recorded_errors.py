@@ -57,6 +57,14 @@ def test_errors_grow_with_the_distance_and_the_turn_of_the_query() -> None:
     assert recorded_sigma(exact, QUERY)[1] < 3e-4
 
 
+def test_errors_beyond_those_of_the_fit_count_in_proportion() -> None:
+    still = AtQuery(QUERY.nearest, QUERY.position_m, QUERY.rotation_rad, 0.0)
+    metres = [recorded_sigma(PoseErrors(of, 0.005, 90.0, 60.0), still)[0] for of in (0.008, 0.016, 0.032, 0.08)]
+    assert metres[1] / metres[0] == pytest.approx(8.0)
+    assert metres[2] / metres[1] == pytest.approx(2.0)
+    assert metres[3] / metres[1] == pytest.approx(5.0)
+
+
 def test_sigma_of_a_query_is_along_an_axis() -> None:
     covariance = np.diag([1e-4, 4e-4, 4e-4, 1e-6, 1e-6, 4e-6])
     query = at_query(covariance, (0.5, 0.6), np.array([0.0, 0.03, 0.04]))
