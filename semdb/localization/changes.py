@@ -74,14 +74,15 @@ class SameEncoder:
     def check(self, changed: bool) -> None:
         """Looks at first, where the map has `changed`, and after an error.
 
-        Raises ProvenanceError where it is not: vectors of queries are compared with those of their own encoder.
+        Raises ProvenanceError where it is not: vectors of queries are compared with those of their own encoder. A map
+        that was deleted has none, and no keyframe, which whoever asks it is told.
         """
         if self._known and not changed:
             return
         found = self._store.encoder_id(self._map_id)
         if self.model_id is None:
             self.model_id = found  # it was empty
-        self._known = found == self.model_id
+        self._known = found in (None, self.model_id)
         if not self._known:
             raise ProvenanceError(
                 f"map {self._map_id} was described anew by another encoder since it was opened: ask again, and it is "

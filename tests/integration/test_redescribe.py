@@ -283,6 +283,19 @@ def test_an_image_that_cannot_be_read_keeps_the_map_as_it_is(open_file_store: St
     assert vectors(store, info).shape == (9, 560)
 
 
+@pytest.mark.parametrize("indexed", [False, True])
+def test_a_map_that_is_deleted_is_not_called_described_anew(open_file_store: Store, indexed: bool) -> None:
+    info = filled(open_file_store)
+    source: Any = SqlSource(open_file_store, info.id)
+    if indexed:
+        source = IndexSource(MapIndex.open(open_file_store, info.id))
+    source.refresh()
+    open_file_store.delete_map(info.id)
+    for _ in range(2):
+        source.refresh()
+        assert source.keyframe_count() == 0
+
+
 def test_a_copy_is_of_one_encoder(open_file_store: Store, tmp_path: Path) -> None:
     info = filled(open_file_store)
 
