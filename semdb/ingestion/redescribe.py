@@ -38,7 +38,6 @@ from semdb.recordings.png import ImageFileError
 from semdb.settings import Settings
 from semdb.types import Float32Array, ImageArray, ModelInfo
 
-WHAT = ("encoder",)
 CHUNK = 8  # keyframes that go through the stages together
 GREY = (
     "only small grey images of its keyframes were kept (SEMDB_KEEP_IMAGES=none), so they have to be described from the "

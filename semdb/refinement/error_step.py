@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, astuple, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -73,7 +73,7 @@ def measure_recording(store: Store, recording_id: int, *, changed: bool) -> None
     """Measures and writes how far the poses of one recording are off, once it is ingested; nothing of few keyframes.
 
     What is there already stays unless keyframes have `changed`; where it is missing, as after a process was killed, it
-    is made up for. Answers come without it, so damaged rows are no reason to fail.
+    is made up for. Answers come without it, so damaged rows are no reason to fail. Raises DatabaseError.
     """
     map_id = map_of(store.engine, recording_id)
     if map_id is None or (not changed and is_measured(store.engine, recording_id)):
@@ -118,7 +118,10 @@ def errors_of(
 def errors_at(
     cache: KeyframeCache, store: Store, map_id: int, keyframe_id: int, ids: Sequence[int], options: ErrorOptions
 ) -> PoseErrors | None:
-    """What one keyframe, localized among those of `ids` that are nearest, shows; None where it is not localized."""
+    """What one keyframe, localized among those of `ids` that are nearest, shows; None where it is not localized.
+
+    Raises CodecError where models of the map are damaged.
+    """
     from semdb.geometry import pose_distances
     from semdb.localization.localizer import LocalizerOptions
     from semdb.localization.pose import estimate_pose, first_pose, match_views
@@ -148,7 +151,9 @@ def errors_at(
     if first is None or not convinces(first, settings.verdict):
         return None
     estimate = estimate_pose(own[0].view, keyframes, matches, pose, first)
-    return None if estimate is None else estimate.evident
+    found = None if estimate is None else estimate.evident
+    # damaged points may be anywhere: what is no number, no database takes
+    return found if found is not None and np.isfinite(astuple(found)).all() else None
 
 
 def spread_over(ids: Sequence[int], most: int) -> list[int]:
