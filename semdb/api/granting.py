@@ -49,7 +49,10 @@ class Granting(Base):
         revoke_token(self._store().engine, token_id)
 
     def access(self, secret: str | None) -> tuple[AccessToken | None, bool]:
-        """The token with this `secret`, if it is valid now, and whether there is any valid one. Raises CodecError."""
+        """The token with this `secret`, if it is valid now, and whether there is any that was not revoked.
+
+        Raises CodecError.
+        """
         from semdb.database.tokens import find_token
 
         row, any_there = find_token(self._store().engine, secret)

@@ -54,7 +54,10 @@ def list_tokens(engine: Engine) -> list[Any]:
 
 
 def find_token(engine: Engine, secret: str | None) -> tuple[Any | None, bool]:
-    """The row of a token that is valid now, and whether there is any valid one at all. Raises CodecError."""
+    """The row of a token that is valid now, and whether there is any that was not revoked. Raises CodecError.
+
+    One that has expired is still there: the end of the last one must not open the service to all.
+    """
     wanted = None if secret is None or len(secret) > LONGEST else hash_of(secret)
 
     def work(connection: Any) -> tuple[Any | None, bool]:
@@ -100,4 +103,4 @@ def _valid() -> ColumnElement[bool]:
 
 # Each request asks these: made once, since making them takes longer than asking.
 _FIND = _rows().where(_t.hash == bindparam("wanted"), _valid())
-_ANY = select(_t.id).where(_valid()).limit(1)
+_ANY = select(_t.id).where(_t.revoked_at.is_(None)).limit(1)

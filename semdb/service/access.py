@@ -80,6 +80,8 @@ class GuardedRoute(APIRoute):
             names.update({key: value.replace(SLASH, "/") for key, value in names.items()})
             if role != PUBLIC:
                 await admit(request, role)
+            if self.body_field is None:  # it takes none, or takes it piece by piece: nothing of it is read here
+                return await handler(request)
             kind = request.headers.get("content-type", "").lower()
             if kind.startswith("application/json"):
                 check_depth(await _body(request))

@@ -305,6 +305,19 @@ def test_a_body_that_comes_slowly_is_let_go(served: Served, tokens: dict[str, st
         assert 0.5 < time.monotonic() - started < 8
 
 
+def test_a_body_that_nobody_asked_for_is_not_read(served: Served, tokens: dict[str, str]) -> None:
+    host, port = served.url.removeprefix("http://").split(":")
+    for kind in ("multipart/form-data; boundary=b", "application/json"):
+        with socket.create_connection((host, int(port)), timeout=10) as unknown:  # anybody may ask for this
+            head = f"GET /health HTTP/1.1\r\nHost: {host}\r\nContent-Type: {kind}\r\nContent-Length: 1000\r\n\r\n"
+            unknown.sendall(head.encode())
+            assert b" 200 " in unknown.recv(65536).partition(b"\r\n")[0]
+        with served.with_token(tokens["ingest"]) as client:  # what is sent to be kept goes to the disk, whatever it is
+            headers = {"Content-Type": kind}
+            sent = client.post("/v1/uploads", params={"name": "a"}, content="[" * 5000, headers=headers)
+            assert (sent.status_code, sent.json()["bytes"]) == (201, 5000)
+
+
 def test_a_client_that_breaks_off_leaves_nothing_behind(
     served: Served, tokens: dict[str, str], names: list[str]
 ) -> None:
@@ -392,6 +405,16 @@ def test_without_a_token_only_this_machine_is_served(served: Served) -> None:
 def command(served: Served, *arguments: object) -> Result:
     given = [*map(str, arguments), "--database-url", served.database.settings.database_url]
     return CliRunner().invoke(app, given)
+
+
+def test_the_end_of_the_last_token_opens_nothing(served: Served) -> None:
+    new = served.database.create_token("read", expires_s=60)
+    with served.database._store().engine.begin() as connection:
+        past = text("UPDATE access_tokens SET expires_at = '2020-01-01 00:00:00' WHERE id = :id")
+        connection.execute(past, {"id": new.token.id})
+    assert served.client.get("/v1/maps").status_code == 401
+    served.database.revoke_token(new.token.id)
+    assert served.client.get("/v1/maps").status_code == 200
 
 
 def test_commands_make_list_and_revoke(served: Served) -> None:
