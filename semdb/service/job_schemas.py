@@ -15,11 +15,15 @@ class JobModel(Model):
     job: int
     address: str = Field(examples=["/v1/jobs/1"])
     map: str
+    name: str = Field(description="of the recording")
     state: str = Field(examples=["running"])
     recordings: list[dict[str, Any]]
     items: dict[str, int] | None = Field(description="keyframes by their state", examples=[{"done": 4, "pending": 2}])
     progress: dict[str, Any] | None = Field(examples=[{"what": "ingesting room", "done": 4, "total": 6}])
     error: str | None
+    attempts: int
+    created_at: str
+    finished_at: str | None
 
 
 class Source(Model):

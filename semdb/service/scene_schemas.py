@@ -39,7 +39,10 @@ class Visit(Model):
     points: int
     seen: int
     seen_through: int
+    occluded: int
+    missed: int
     position: Vector3 | None
+    size: Vector3 | None
 
 
 class LandmarkHistory(Sightings):

@@ -125,6 +125,7 @@ class Recording(Model):
 
     id: int
     map: str
+    map_id: int
     name: str
     format: str
     source: str | None
@@ -134,6 +135,7 @@ class Recording(Model):
     keyframes: int
     objects: int
     keypoints: int
+    image_bytes: int
 
 
 class CameraModel(Model):
@@ -242,6 +244,8 @@ class Answer(Model):
     model_config = example(ANSWER)
 
     image: str
+    frame_index: int | None = Field(description="as it was given, and the time")
+    timestamp_ns: int | None
     verdict: Literal["localized", "ambiguous", "coarse", "failed"]
     map: str
     pose: Pose | None
@@ -252,7 +256,10 @@ class Answer(Model):
     inliers: int
     stage: str
     reason: str
+    ranked_share: float = Field(description="of the map's keyframes, by the filter by class")
+    keyframes_matched: int
     candidates: list[CandidateModel]
+    refinements: dict[str, str] = Field(description="by step of `semdb refine`: what of it was used")
     objects: list[SeenObject]
     notes: list[str] = Field(description="what was assumed")
     timing_ms: dict[str, float | None]
@@ -279,6 +286,15 @@ class DeletedModel(Model):
     keyframes: int
 
 
+class Relation(Model):
+    """How a landmark stands to another one."""
+
+    landmark: int
+    kind: str = Field(examples=["on"])
+    other_landmark: int
+    score: float
+
+
 class Landmark(Model):
     """A thing that several keyframes see."""
 
@@ -288,19 +304,16 @@ class Landmark(Model):
     probability: float
     position: Vector3
     covariance: Matrix
-    box: dict[str, Any]
+    classes: dict[str, float] = Field(description="what it was taken for, and how surely")
+    box: dict[str, Any] = Field(description="`size` in metres, `yaw` about the map's up")
     state: str = Field(examples=["confirmed"])
     sightings: int
     keyframes: int
-
-
-class Relation(Model):
-    """How a landmark stands to another one."""
-
-    landmark: int
-    kind: str = Field(examples=["on"])
-    other_landmark: int
-    score: float
+    missed: int
+    seen_through: int
+    first_seen_ns: int | None
+    last_seen: dict[str, Any] = Field(description="`recording`, `frame_index`, `timestamp_ns`")
+    relations: list[Relation] | None = Field(None, description="where one landmark is asked for")
 
 
 class Found(Model):
@@ -314,29 +327,50 @@ class Found(Model):
 class ChangesModel(Model):
     """What changed between two recordings, as `semdb changes --json` prints it."""
 
+    map: str
+    between: list[str] = Field(description="the names of both", examples=[["monday", "friday"]])
+    counts: dict[str, int]
+    changes: list[dict[str, Any]]
+    landmarks: list[dict[str, Any]] = Field(description="what both say of each")
+
 
 class Link(Model):
     """What ties two keyframes together."""
 
     map: str
     keyframe: int
+    recording: str
+    frame_index: int
     other_keyframe: int
+    other_recording: str
+    other_frame_index: int
     kind: str
     state: str
     inliers: int
     off_m: float | None
     off_deg: float | None
+    reason: str
+    provenance: str
+    first_from_second: Matrix
+    information: Matrix
 
 
 class Query(Model):
     """A localization that was logged; `map` where one is asked for."""
 
     id: int
+    map: str | None = None
     created_at: str
     image: str
     verdict: str
     pose: Pose | None
+    world_from_camera: Matrix | None
     confidence: float
+    inliers: int
+    stage: str
+    reason: str
+    candidates: list[dict[str, Any]]
+    timing_ms: dict[str, float | None]
 
 
 class CoverageModel(Model):

@@ -49,6 +49,8 @@ class Tracked(Model):
     model_config = example(_TRACKED)
 
     image: str
+    frame_index: int | None = Field(description="as it was given, and the time")
+    timestamp_ns: int | None
     time_s: float
     state: Literal["initialising", "tracking", "coasting", "lost"]
     source: Literal["tracked", "relocalised", "odometry", "predicted", "none"]
@@ -61,6 +63,7 @@ class Tracked(Model):
     reason: str
     map_from_odom: Pose | None = Field(description="corrects the odometry, where frames bring it")
     map_from_odom_matrix: Matrix | None
+    smoothed: bool
     latency_ms: float
     frames: int = Field(description="of this camera so far, as this process knows it: 1 where it is looked for anew")
     notes: list[str] = Field(description="what was assumed")
@@ -82,6 +85,10 @@ class Watched(Model):
     state: str
     pose: Pose | None
     covariance: Matrix | None
+    confidence: float | None
+    reason: str | None
+    timestamp_ns: int | None
+    frame_index: int | None
 
 
 class LiveCameras(Model):

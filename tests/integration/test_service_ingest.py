@@ -123,6 +123,7 @@ def test_a_zip_is_unpacked_and_ingested(served: Served, room: Path) -> None:
 
 
 def test_bombs_and_ways_out_of_a_zip(served: Served) -> None:
+    served.service.uploads.folder.mkdir(parents=True, exist_ok=True)
     before = set(served.service.uploads.folder.iterdir())
     bad = {
         413: [zipped({"a": bytes(50 * 2**20)}), zipped({"a": bytes(30 * 2**20)})],  # too large; 1000 to one

@@ -239,3 +239,54 @@ def test_the_state_of_a_scene_follows_all_that_it_shows(store: Store) -> None:
     fill(store, "another")
     assert scene_state(store.engine, map_id) == states[-1]
     assert len(set(states)) == len(states)
+
+
+def test_the_document_names_all_that_is_answered(served: Served) -> None:
+    document = served.api.openapi()
+    keyframe = served.database.keyframes("office")[0].id
+    photo = served.client.get(f"/v1/keyframes/{keyframe}/image").content
+    form = {"matches": "true", "masks": "true"}
+    answer = served.client.post("/v1/maps/office/localize", data=form, files={"image": photo}).json()
+    session = served.client.post("/v1/maps/office/sessions", json={}).json()
+    tracked = served.client.post(session["frames"], files={"image": photo}).json()
+    thing = max(served.database.landmarks("office"), key=lambda one: one.sightings).id
+    job = served.database.add_job("office", "loopback", {"path": "/somewhere/kitchen"})
+    query = served.database.queries("office")[0].id
+    in_address = {"map": "office", "recording": "room", "keyframe": keyframe, "landmark": thing, "job": job}
+    asked = {"what": "chair", "before": "room", "after": "room", "sql": "SELECT 1", "odometry": "true", "masks": "true"}
+
+    def unnamed(value: Any, schema: Any, where: str) -> Iterator[str]:
+        schema = document["components"]["schemas"].get(schema.get("$ref", "").rpartition("/")[2], schema)
+        if "anyOf" in schema:
+            yield from unnamed(value, schema["anyOf"][0], where)
+        elif isinstance(value, dict):
+            for name, inner in value.items() if "properties" in schema else ():
+                if name in schema["properties"]:
+                    yield from unnamed(inner, schema["properties"][name], f"{where}.{name}")
+                else:
+                    yield f"{where}.{name}"
+        elif isinstance(value, list) and "items" in schema:
+            for inner in value[:3]:
+                yield from unnamed(inner, schema["items"], where)
+
+    def schema_of(operation: Any, status: str) -> Any:
+        return operation["responses"][status]["content"].get("application/json", {}).get("schema", {})
+
+    paths = document["paths"]
+    found = [
+        *unnamed(answer, schema_of(paths["/v1/maps/{map}/localize"]["post"], "200"), "answer"),
+        *unnamed(session, schema_of(paths["/v1/maps/{map}/sessions"]["post"], "201"), "session"),
+        *unnamed(tracked, schema_of(paths["/v1/sessions/{session}/frames"]["post"], "200"), "tracked"),
+    ]
+    looked = 0
+    for path, operations in paths.items():
+        schema = schema_of(operations["get"], "200") if "get" in operations else {}
+        if schema:
+            known = {one["name"] for one in operations["get"].get("parameters", [])}
+            known -= set() if "changes" in path else {"before", "after"}  # elsewhere they are keys
+            given = {name: value for name, value in asked.items() if name in known}
+            told = served.client.get(path.format(**in_address, query=query), params=given)
+            if told.status_code == 200:
+                looked += 1
+                found += unnamed(told.json(), schema, path)
+    assert (found, looked > 25) == ([], True), looked
