@@ -77,14 +77,14 @@ export async function getBytes(address: string, until?: AbortSignal): Promise<Ar
   return (await ask(address, { until })).arrayBuffer();
 }
 
-/** All pages of a list, or the first `most` items of it. */
-export async function getAll<T>(address: string, until?: AbortSignal, most = Infinity): Promise<T[]> {
+/** All pages of a list, or the first `most` items of it; `under` is what the answer calls them. */
+export async function getAll<T>(address: string, until?: AbortSignal, most = Infinity, under = "items"): Promise<T[]> {
   const items: T[] = [];
   let next: string | null = address;
   while (next !== null && items.length < most) {
-    const page: { items: T[]; next: string | null } = await get(next, until);
-    items.push(...page.items);
-    next = page.next;
+    const page: Record<string, unknown> = await get(next, until);
+    for (const item of page[under] as T[]) items.push(item);
+    next = page["next"] as string | null;
   }
   return items;
 }

@@ -235,8 +235,8 @@ class Follow {
 
   private async failures(one: Recording, cell: HTMLElement): Promise<void> {
     try {
-      const found = await get<{ failures: { frame_index: number; error: string }[] }>(`/v1/maps/${part(one.map)}/recordings/${part(one.name)}/failures`, this.until);
-      fill(cell, h("ul", { class: "plain" }, found.failures.map((failure) => h("li", { attrs: { dir: "auto" } }, texts.ingest.failure(failure.frame_index, failure.error)))));
+      const found = await getAll<{ frame_index: number; error: string }>(`/v1/maps/${part(one.map)}/recordings/${part(one.name)}/failures`, this.until, Infinity, "failures");
+      fill(cell, h("ul", { class: "plain" }, found.map((failure) => h("li", { attrs: { dir: "auto" } }, texts.ingest.failure(failure.frame_index, failure.error)))));
     } catch (error) {
       if (!this.until.aborted) toast(error instanceof Error ? error.message : String(error));
     }

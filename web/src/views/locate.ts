@@ -160,6 +160,7 @@ class Locating {
       this.draw();
       if (index === this.chosen) this.choose(index);
     }
+    if (this.busy.signal !== signal) return; // others were dropped meanwhile: what is shown is theirs
     stop.remove();
     const done = this.results.filter((one) => one.answer !== null);
     this.progress.textContent = texts.locate.done(done.filter((one) => one.answer?.verdict === "localized").length, this.results.length);

@@ -1,5 +1,5 @@
 // A thing: what it looks like, how sure it is, what it stands near, where it was when.
-import { get, load, part } from "../../api";
+import { get, getAll, load, part } from "../../api";
 import { type LandmarkItem, css, hueColour } from "../../model";
 import { link } from "../../router";
 import { eigen3 } from "../../statistics";
@@ -30,7 +30,7 @@ const CROPS = 12;
 export function showLandmark(context: MapContext, item: LandmarkItem, place: HTMLElement): void {
   const address = `/v1/maps/${part(context.name)}/landmarks/${item.id}`;
   const { until } = context;
-  const history = get<History>(`${address}/sightings`, until);
+  const history = historyOf(`${address}/sightings`, until);
   history.catch(() => undefined);
   const about = get<LandmarkInfo>(address, until);
   about.catch(() => undefined);
@@ -65,6 +65,13 @@ export function showLandmark(context: MapContext, item: LandmarkItem, place: HTM
     section(texts.landmark.visits, async () => visits((await history).visits)),
     section(texts.landmark.sightings, async () => sightings(context, (await history).sightings)),
   );
+}
+
+/** With all pages of sightings: the clearest may be on any of them. */
+async function historyOf(address: string, until: AbortSignal): Promise<History> {
+  const first = await get<History & { next: string | null }>(address, until);
+  const others = first.next === null ? [] : await getAll<Sighting>(first.next, until, Infinity, "sightings");
+  return { visits: first.visits, sightings: [...first.sightings, ...others] };
 }
 
 function statement(id: number): string {
