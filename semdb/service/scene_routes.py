@@ -40,8 +40,13 @@ async def get_scene(request: Request, map: MapName) -> Response:
     tag = tag_of(f"{semdb.__version__} {service_of(request).database.url} {map} {state}".encode())
     if has(request, tag):
         return tagged(request, b"", "application/json", for_ever=False, tag=tag)
-    found = await draw(request, lambda db: _kept(_scenes, (db.url, map, state, 0), lambda: encoded(db.scene(map))))
-    return tagged(request, found, "application/json", for_ever=False, tag=tag)
+
+    def look(db: Database) -> tuple[bytes, bool]:
+        key = (db.url, map, state, 0)
+        return _kept(_scenes, key, lambda: encoded(db.scene(map)), lambda: db.scene_state(map))
+
+    found, is_of_state = await draw(request, look)
+    return tagged(request, found, "application/json", for_ever=False, tag=tag if is_of_state else None)
 
 
 @table.route("GET", "/v1/maps/{map}/points", READ, errors=(304,), only=_FILE)
@@ -61,23 +66,32 @@ async def get_points(
 
 def _points(db: Database, map_name: str, count: int) -> bytes:
     key = (db.url, map_name, db.map_state(map_name), count)
-    return _kept(_clouds, key, lambda: db.cloud(map_name, count).packed())
+    return _kept(_clouds, key, lambda: db.cloud(map_name, count).packed(), lambda: db.map_state(map_name))[0]
 
 
 def _kept(
-    where: OrderedDict[tuple[str, str, str, int], bytes], key: tuple[str, str, str, int], make: Callable[[], bytes]
-) -> bytes:
-    """What was made for that key, or is made now; only the last few are kept."""
+    where: OrderedDict[tuple[str, str, str, int], bytes],
+    key: tuple[str, str, str, int],
+    make: Callable[[], bytes],
+    state: Callable[[], str],
+) -> tuple[bytes, bool]:
+    """What was made for that key, or is made now; only the last few are kept.
+
+    And whether it is of the state in the key: what is made while the map changes is not, and the map may come back to
+    that state.
+    """
     with _turn:
         if key in where:
             where.move_to_end(key)
-            return where[key]
+            return where[key], True
     made = make()
+    if state() != key[2]:
+        return made, False
     with _turn:
         where[key] = made
         while len(where) > MOST_KEPT:
             where.popitem(last=False)
-    return made
+    return made, True
 
 
 @table.route("GET", "/v1/maps/{map}/landmarks/{landmark}/sightings", READ, schemas.LandmarkHistory)

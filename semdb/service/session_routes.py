@@ -37,6 +37,7 @@ from semdb.service.middleware import check_depth, close_reason, tell
 from semdb.service.problems import Problem, busy, not_found, problem_of
 from semdb.service.roles import LOCALIZE, ON_LOOPBACK
 from semdb.service.routing import MapName, Table
+from semdb.service.settings import MIB
 from semdb.service.signing import LONGEST, opened, signed
 from semdb.service.state import Service, access_of, gone, service_of
 from semdb.service.tracked import Common, FrameGiven, numbers_of, open_tracker, pose_of, track
@@ -247,7 +248,9 @@ async def _answered(service: Service, common: Common, said: dict[str, Any], file
 
 
 async def _message(socket: WebSocket) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """What was said of a frame, and its files. Raises Problem 422 for what is none."""
+    """What was said of a frame, and its files. Raises Problem 422 for what is none, 413 for what is too large."""
+    service: Service = socket.app.state.service
+    most = int(service.settings.max_upload_mb * MIB)
     said: dict[str, Any] = {}
     parts: list[str] = ["image"]
     message = await _received(socket)
@@ -261,6 +264,8 @@ async def _message(socket: WebSocket) -> tuple[dict[str, Any], dict[str, bytes]]
         if isinstance(data, str):
             raise Problem(422, f"the {part} is expected as a binary message")
         files[part] = data
+        if sum(map(len, files.values())) > most:
+            raise Problem(413, f"the files of a frame are larger than {service.settings.max_upload_mb:g} MiB")
     return said, files
 
 

@@ -220,6 +220,25 @@ def test_a_scene_that_did_not_change_is_not_made_again(served: Served, monkeypat
     assert (other.status_code, other.json()["up"]) == (200, [0.0, 0.6, 0.8])
 
 
+def test_a_scene_that_changes_while_it_is_made_is_not_kept(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    database, kind = served.database, type(served.database)
+    database.tell_up("office", (0.0, 0.8, 0.6))
+    before, scene = database.scene_state("office"), kind.scene
+
+    def turned(self: Any, name: str) -> Any:
+        self.tell_up(name, (0.6, 0.0, 0.8))
+        return scene(self, name)
+
+    monkeypatch.setattr(kind, "scene", turned)
+    mixed = served.client.get("/v1/maps/office/scene")
+    assert mixed.json()["up"] == [0.6, 0.0, 0.8]
+    monkeypatch.undo()
+    database.tell_up("office", (0.0, 0.8, 0.6))
+    again = served.client.get("/v1/maps/office/scene", headers={"If-None-Match": mixed.headers["ETag"]})
+    assert (again.status_code, again.json()["up"]) == (200, [0.0, 0.8, 0.6])
+    assert database.scene_state("office") == before
+
+
 def test_the_state_of_a_scene_follows_all_that_it_shows(store: Store) -> None:
     map_id, _, keyframes = fill(store)
     stored_landmarks(store, map_id)

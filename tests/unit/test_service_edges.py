@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from semdb.service.cameras import Live, Sessions
 from semdb.service.middleware import Doorkeeper, close_reason
 from semdb.service.problems import Problem
+from semdb.service.session_routes import _message
 from semdb.service.settings import ServeSettings
 from semdb.service.streams import Streams
 
@@ -70,3 +72,22 @@ def test_one_who_follows_much_leaves_places_for_others() -> None:
             streams.check("c")
     streams.check("a")
     assert len(streams) == 0
+
+
+def test_the_parts_of_a_frame_are_no_larger_than_a_form() -> None:
+    def told(*sizes: int) -> Any:
+        messages = iter([{"type": "websocket.receive", "text": '{"parts": ["image", "depth"]}'}])
+        files = iter([{"type": "websocket.receive", "bytes": bytes(size)} for size in sizes])
+
+        async def receive() -> Any:
+            return next(messages, None) or next(files)
+
+        service = SimpleNamespace(settings=ServeSettings(max_upload_mb=0.5))
+        app = SimpleNamespace(state=SimpleNamespace(service=service))
+        socket: Any = SimpleNamespace(app=app, receive=receive)
+        return asyncio.run(_message(socket))
+
+    assert {part: len(data) for part, data in told(300_000, 200_000)[1].items()} == {"image": 300_000, "depth": 200_000}
+    with pytest.raises(Problem, match=r"larger than 0\.5 MiB") as refused:
+        told(300_000, 300_000)
+    assert refused.value.status == 413
