@@ -76,7 +76,19 @@ def test_every_program_of_the_page_works(served: Served, monkeypatch: pytest.Mon
 
 
 def test_the_page_names_every_route() -> None:
-    text = PAGE.read_text()
-    for path in make_api(Service(Database(Settings()), ServeSettings())).openapi()["paths"]:
+    text, document = PAGE.read_text(), make_api(Service(Database(Settings()), ServeSettings())).openapi()
+    for path in document["paths"]:
         start, _, end = path.rpartition("/")
         assert f"`{path}`" in text or f" {path}" in text or (f"`/{end}`" in text and start in text), path
+
+
+def test_the_page_names_every_parameter() -> None:
+    text, document = PAGE.read_text(), make_api(Service(Database(Settings()), ServeSettings())).openapi()
+    for path, operations in document["paths"].items():
+        for operation in operations.values():
+            names = [one["name"] for one in operation.get("parameters", []) if one["in"] == "query"]
+            for content in operation.get("requestBody", {}).get("content", {}).values():
+                schema = content["schema"].get("$ref", "").rpartition("/")[2]
+                names += document["components"]["schemas"].get(schema, {}).get("properties", {})
+            for name in names:
+                assert f"`{name}`" in text or re.search(rf"\b{name}=", text), (path, name)
