@@ -92,7 +92,7 @@ def test_a_second_visit_with_moved_objects_other_light_and_blur(first_visit: str
     options = SyntheticOptions(frames=60, lap_frames=60, seed=5, second_visit=True, lighting=0.6, blur=0.4, noise=True)
     recording = render(tmp_path / "second", options)
     truth = {entry.image_path.name: entry.world_from_camera for entry in open_recording(recording).entries}
-    answers = localize(recording, first_visit, 3)
+    answers = localize(recording, first_visit, 4)
     errors: dict[str, list[tuple[float, float]]] = {"localized": [], "ambiguous": [], "failed": []}
     for answer in answers:
         if answer["verdict"] != "failed":

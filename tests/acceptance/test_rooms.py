@@ -7,7 +7,7 @@ import pytest
 from bench.rooms import Row, compare, render
 from semdb.recordings.synthetic import SyntheticOptions
 
-ROOMS = 4
+ROOMS = 3
 
 
 @pytest.fixture(scope="module")

@@ -364,7 +364,7 @@ def test_accounts_that_cannot_be_made(tmp_path: Path) -> None:
         accounts.plan_accounts(url, passwords={"owner": "a\\"})
     made = accounts.plan_accounts(url, passwords=dict.fromkeys(accounts.ROLES, "p'w"))
     assert made.statements[1] == "CREATE USER 'semdb_owner'@'%' IDENTIFIED BY 'p''w'"
-    assert made.statements[-1] == "REVOKE CREATE ON `semdb`.`landmark_visit_list` FROM 'semdb_reader'@'%'"
+    assert made.statements[-1] == "REVOKE CREATE ON `semdb`.`recording_pose_errors` FROM 'semdb_reader'@'%'"
     assert not any("access_tokens" in statement or "service_jobs" in statement for statement in made.statements)
     again = accounts.plan_accounts(url, roles=("reader",), grants=True)
     assert again.statements[0] == "GRANT SELECT, SHOW VIEW ON `semdb`.* TO 'semdb_reader'@'%'"

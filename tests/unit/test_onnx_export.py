@@ -74,6 +74,7 @@ def test_detector_is_the_same_at_any_size(checkpoint: Path, exported: Exported) 
         assert found.equal
 
 
+@pytest.mark.long
 def test_resnet101_is_the_same(tmp_path: Path) -> None:
     """The paper's backbone at a fifth of its size."""
     architecture = Architecture("resnet101", min_size=160, max_size=320)

@@ -27,7 +27,7 @@ SMALL = SyntheticOptions(frames=12, width=320, height=240, lap_frames=40)
 DEMO = SyntheticOptions(frames=80)  # as scripts/demo.sh has it
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")  # its loop must not run when other tests ask for one
 def browser() -> Iterator[Any]:
     with chromium() as found:
         yield found
@@ -40,7 +40,7 @@ WORLDS = [
 ]
 
 
-@pytest.fixture(scope="session", params=WORLDS)
+@pytest.fixture(scope="package", params=WORLDS)
 def world(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
     """A map with things, of a hostile name, beside an empty one."""
     kind, _, server = request.param.partition("-")

@@ -19,6 +19,7 @@ const REST_MS = 220;
 /** A frame is to take so long; what is drawn in it follows what the last ones took. */
 const AIM_MS = 45;
 const PAUSE_MS = 30;
+const ENOUGH = 0.7; // of what may be drawn
 const LEAST = 12_000; // less saves little: a frame without any takes longer than these
 const MOST = 4_000_000;
 const ONCE = 0;
@@ -35,6 +36,7 @@ export class Painter {
   private idle = 0; // milliseconds from the last frame until another one was asked for
   private anew = true;
   private budget: number;
+  private spent = 0; // of it in the last frame
 
   constructor(
     private readonly renderer: WebGLRenderer,
@@ -106,6 +108,7 @@ export class Painter {
       part.object.geometry.setDrawRange(from * part.vertices, (to - from) * part.vertices);
       this.done[k] = to;
     });
+    this.spent = this.budget - left;
     const camera = this.camera();
     camera.layers.set(first ? ONCE : AGAIN);
     this.renderer.autoClear = first;
@@ -124,6 +127,7 @@ export class Painter {
     this.frames.push(took);
     if (this.frames.length > 200) this.frames.shift();
     const factor = Math.min(1.4, Math.max(0.4, AIM_MS / took));
+    if (factor > 1 && this.spent < ENOUGH * this.budget) return; // a frame that drew little tells nothing of more
     this.budget = Math.min(MOST, Math.max(LEAST, this.budget * (factor < 1 ? factor : Math.sqrt(factor))));
   }
 }
