@@ -247,7 +247,6 @@ class Localizing(Base):
             paths=paths,
             say=self._say,
         )
-        told: set[str] = set()
         for number, read in enumerate(items):
             started = time.perf_counter()
             try:
@@ -260,10 +259,8 @@ class Localizing(Base):
             decode_ms = (time.perf_counter() - started) * 1000
             maps = open_maps.asked(map, coarse) if number else maps  # as they are now
             found = ask(maps, query, lambda entry: open_maps.cameras([entry]), self._say, tolerance)
-            line = said_of(found.localization.map_name)
-            if found.unmasked and line not in told:
-                told.add(line)
-                self._say(line)
+            if found.unmasked:
+                reader.tell(said_of(found.localization.map_name))
             timing = {"decode": decode_ms, **found.description.timing_ms, **found.localization.timing_ms}
             timing["total"] = (time.perf_counter() - started) * 1000
             found = replace(found, localization=replace(found.localization, timing_ms=timing))

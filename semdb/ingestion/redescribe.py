@@ -10,8 +10,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-import cv2
-
 from semdb.database.encodings import (
     add_vectors,
     drop_vectors,
@@ -30,7 +28,7 @@ from semdb.ingestion.planned import open_planned
 from semdb.perception.encoders import load_encoder
 from semdb.perception.model_choice import spec_for_redescription
 from semdb.perception.protocols import BatchEncoder, Encoder
-from semdb.perception.quality import stretch_of, stretched
+from semdb.perception.quality import with_contrast
 from semdb.recordings.base import FrameEntry, Recording
 from semdb.recordings.images import decode_color
 from semdb.recordings.jpeg import JPEG_START, read_jpeg_header
@@ -164,18 +162,12 @@ def _groups(kinds: Sequence[ImageKind]) -> Iterator[_Some]:
 def _read(sources: _Sources, some: _Some, failed: dict[int, str]) -> _Some:
     for kind in some.kinds:
         try:
-            some.images[kind.keyframe_id] = _as_described(sources.image(kind))
+            some.images[kind.keyframe_id] = with_contrast(sources.image(kind))[0]
         except NotFoundError:
             continue  # it was deleted meanwhile
         except (CodecError, FrameError) as error:
             failed[kind.keyframe_id] = str(error)
     return some
-
-
-def _as_described(image: ImageArray) -> ImageArray:
-    """As a describer shows it to the encoder."""
-    stretch = stretch_of(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
-    return image if stretch is None else stretched(image, stretch)
 
 
 def _encode(encoder: Encoder, some: _Some) -> _Some:

@@ -24,7 +24,7 @@ from semdb.localization.verdict import Judgement, VerdictOptions
 from semdb.localization.views import ClassNumbers, KeyframeView, View, make_view
 from semdb.perception.keypoints import find_keypoints
 from semdb.perception.protocols import FeatureExtractor
-from semdb.perception.quality import stretch_of, stretched
+from semdb.perception.quality import with_contrast
 from semdb.types import Description, Float32Array, FloatArray, ImageArray, Tolerance, Verdict
 
 CAPACITY = 128  # keyframes; about 0.7 MiB each
@@ -82,8 +82,7 @@ def fallback_cache(store: Store, fallback: Fallback, numbers: ClassNumbers) -> S
     def made(stored: StoredKeyframe, depth: Float32Array, grey: ImageArray) -> View | None:
         categories = [found.category for found in stored.objects]
         objects = list(zip(categories, store.load_masks(stored.id), strict=True))
-        stretch = stretch_of(grey)  # as the query is, where it has little contrast
-        seen = grey if stretch is None else stretched(grey, stretch)
+        seen, _ = with_contrast(grey)  # as the query is shown
         keypoints = find_keypoints(fallback.extractor, stored.camera, seen, depth, objects, fallback.dynamic)
         view = make_view(stored.camera, keypoints, categories, numbers, with_points_only=True, grey=grey)
         return replace(view, inverse_depth=small_inverse_depth(stored.camera, depth))

@@ -202,8 +202,7 @@ def ask(
             if say is not None and len(maps) > 1:
                 say(f"map {entry.head.name!r} does not answer: {error}")
         else:
-            unmasked = lacks_masks(entry.describer, scaled)
-            answers.append((scaled, described[key], with_reason(found) if unmasked else found, unmasked))
+            answers.append((scaled, described[key], found, lacks_masks(entry.describer, scaled)))
     if not answers:
         raise refused[0]
     order = {Verdict.LOCALIZED: 3, Verdict.AMBIGUOUS: 2, Verdict.COARSE: 1, Verdict.FAILED: 0}
@@ -215,5 +214,4 @@ def ask(
         reason = f"map {rivals[0].map_name!r} fits as well: {rivals[0].inliers} against {best.inliers} inliers"
         confidence = min(best.confidence, RIVAL_CONFIDENCE)
         best = replace(best, verdict=Verdict.AMBIGUOUS, confidence=confidence, reason=reason)
-        best = with_reason(best) if unmasked else best
-    return ImageLocalization(query, description, best, unmasked)
+    return ImageLocalization(query, description, with_reason(best) if unmasked else best, unmasked)

@@ -17,7 +17,7 @@ from semdb.perception.encoders import load_encoder
 from semdb.perception.lifting import lift
 from semdb.perception.objects import assign_to_objects, object_geometry, sort_by_object
 from semdb.perception.protocols import BatchDetector, BatchEncoder, Detector, Encoder, FeatureExtractor
-from semdb.perception.quality import stretch_of, stretched
+from semdb.perception.quality import with_contrast
 from semdb.settings import Settings
 from semdb.types import (
     Camera,
@@ -104,11 +104,9 @@ class Describer:
         """
         for view in views:
             _check_sizes(view.image, view.depth, view.camera)
-        stretches = [stretch_of(cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY)) for view in views]
-        views = [
-            view if stretch is None else replace(view, image=stretched(view.image, stretch))
-            for view, stretch in zip(views, stretches, strict=True)
-        ]
+        shown = [with_contrast(view.image) for view in views]
+        stretches = [stretch for _, stretch in shown]
+        views = [replace(view, image=image) for view, (image, _) in zip(views, shown, strict=True)]
         found, detect_ms = _timed(lambda: self._detect(views))
         vectors, encode_ms = _timed(lambda: self._encode([view.image for view in views]))
         shares = {"detect": detect_ms / max(1, len(views)), "encode": encode_ms / max(1, len(views))}

@@ -47,6 +47,12 @@ def stretched(image: ImageArray, stretch: tuple[float, float]) -> ImageArray:
     return np.asarray(cv2.LUT(image, table), np.uint8)
 
 
+def with_contrast(image: ImageArray) -> tuple[ImageArray, tuple[float, float] | None]:
+    """`image` uint8, RGB ``[H, W, 3]`` or grey ``[H, W]``, as whatever describes it is shown it, and its stretch."""
+    stretch = stretch_of(image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8))
+    return (image if stretch is None else stretched(image, stretch)), stretch
+
+
 def image_quality(grey: ImageArray, stretch: tuple[float, float] | None = None) -> ImageQuality:
     """The quality of `grey` uint8 ``[H, W]``, which `stretch` was made of, where it is not the image as it was seen."""
     _, fifth, other, _ = contrast_range(grey)
