@@ -18,9 +18,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import pickle
 import sys
 import tempfile
 import time
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -102,18 +104,33 @@ class Place:
 
 
 class Remembered:
-    """A detector and an encoder whose answers are kept, so that every feature is told the same at no cost."""
+    """A detector and an encoder whose answers are kept, so that every feature is told the same at no cost.
 
-    def __init__(self, describer: Describer) -> None:
+    `file` keeps them between runs, for these networks.
+    """
+
+    def __init__(self, describer: Describer, file: Path) -> None:
         self.key: object = None
-        self._describer = describer
+        self._describer, self._file = describer, file
+        self._networks = describer.detector.info, describer.encoder.info
         self._found: dict[object, tuple[tuple[Detection, ...], Float32Array]] = {}
+        if file.exists():
+            networks, found = pickle.loads(zlib.decompress(file.read_bytes()))
+            self._found = found if networks == self._networks else {}
+        self._saved = len(self._found)
         self.detector: Any = _Half(describer.detector, self.detect)
         self.encoder: Any = _Half(describer.encoder, self.encode)
 
     @property
     def knows(self) -> bool:
         return self.key in self._found
+
+    def save(self) -> None:
+        if len(self._found) > self._saved:
+            new = self._file.with_name(self._file.name + ".new")
+            new.write_bytes(zlib.compress(pickle.dumps((self._networks, self._found)), 1))
+            new.replace(self._file)
+            self._saved = len(self._found)
 
     def _both(self, image: ImageArray, instances: InstanceMasks | None) -> tuple[tuple[Detection, ...], Float32Array]:
         if self.key not in self._found:
@@ -179,7 +196,7 @@ class Measuring:
         self.place, self.settings, self.work = place, settings, work
         specs = specs_for_ingest(settings, (), has_masks=place.recording.categories is not None)
         self._first = describer_from_specs(specs.detector, specs.encoder, "surf", settings)
-        self._remembered = Remembered(self._first)
+        self._remembered = Remembered(self._first, work / f"{place.recording.name}-networks.pickle")
         self._extractors: dict[str, FeatureExtractor] = {}
         self._described: dict[tuple[str, str, int], tuple[Description, float]] = {}
 
@@ -228,6 +245,7 @@ class Measuring:
         with self.store(contestant.features, task) as store:
             localizer = make_localizer(store, store.find_map("m"), "sql", settings=own)
             answers = list(self._answers(localizer, contestant, task, condition))
+            self._remembered.save()
             return _row(
                 (self.place.recording.name, len(store.keyframe_ids(1)), condition, contestant.name),
                 answers, kilobytes(store),

@@ -134,6 +134,7 @@ def database(settings: Settings) -> Iterator[Check]:
         schema.check_schema(engine)
         yield Check("ok", "schema", f"revision {schema.HEAD}")
         yield from crops(engine)
+        yield from sparse(engine, settings)
     finally:
         engine.dispose()
 
@@ -154,6 +155,26 @@ def crops(engine: Engine) -> Iterator[Check]:
             advice = for_shell(["semdb", "ingest", "--redescribe", "encoder", "--map", head.name])
             yield Check(
                 "info", f"map {head.name}", f"made with the crop {found[0]}, new maps have {found[1]}: {advice}"
+            )
+
+
+def sparse(engine: Engine, settings: Settings) -> Iterator[Check]:
+    """Maps whose keyframes are far apart, where another feature would be sure of more images (docs/features.md)."""
+    from semdb.database.lookups import map_heads
+    from semdb.database.reading import poses
+    from semdb.localization.learned_matching import is_learned
+    from semdb.localization.spacing import spacing_of
+
+    for head in [] if settings.features_fallback else map_heads(engine):
+        if head.damage or is_learned(head.models):
+            continue
+        spacing = spacing_of(poses(engine, head.id, bad=lambda *_: None)[1])
+        if spacing is not None and spacing.is_wide:
+            yield Check(
+                "info",
+                f"map {head.name}",
+                f"its keyframes are far apart (to the nearest {spacing} in the median): of images between them many "
+                "may stay in doubt; SEMDB_FEATURES_FALLBACK=onnx:FILE is sure of more, and so are more keyframes",
             )
 
 

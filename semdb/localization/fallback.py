@@ -6,7 +6,7 @@ and kept in memory. So every map has them that has images and depth.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -14,9 +14,10 @@ import numpy as np
 from semdb.database.records import StoredKeyframe
 from semdb.database.store import Store
 from semdb.geometry import invert_pose, pose_error, transform_points
+from semdb.localization.alike import Alike, Seen, WithDepth, alike_of
 from semdb.localization.confidence import Evidence
 from semdb.localization.learned_matching import KeypointMatcher, for_learned, is_learned
-from semdb.localization.likeness import likeness_by_depth, small_inverse_depth
+from semdb.localization.likeness import small_inverse_depth
 from semdb.localization.pose import PoseEstimate
 from semdb.localization.pose_options import PoseOptions
 from semdb.localization.shape_cache import ShapeCache
@@ -104,37 +105,17 @@ def asked_first(keyframes: Sequence[KeyframeView], pairs: Sequence[int]) -> list
     return [batch for batch in (ids[:first], ids[first : first + BATCHES[1]]) if batch]
 
 
-@dataclass(frozen=True, slots=True)
-class Alike:
-    """What looks alike in the query and the best keyframe of each feature, by measured depth; shares."""
+def alike_by_depth(own: Seen | None, other: Seen | None, with_depth: WithDepth) -> Alike | None:
+    """What looks alike about the pairs of the feature where it is less, and the mean of both of all that is seen.
 
-    about: float  # the inliers of the feature where it is less
-    in_all: float  # mean of both
-
-
-def alike_by_depth(
-    own: tuple[View, KeyframeView, PoseEstimate] | None,
-    other: tuple[View, KeyframeView, PoseEstimate] | None,
-    with_depth: Callable[[Sequence[int]], Sequence[KeyframeView]],
-) -> Alike | None:
-    """Of each feature the query, its best keyframe and its pose; `with_depth` gives keyframes of ids that have it.
-
-    None where one has no pose, or cannot be compared.
+    Of each feature the query, its best keyframe and its pose. None where one has no pose, or cannot be compared.
     """
     if own is None or other is None:
         return None
-    depths = {keyframe.keyframe_id: keyframe for keyframe in with_depth([own[1].keyframe_id, other[1].keyframe_id])}
-    found = []
-    for query, keyframe, estimate in (own, other):
-        if keyframe.keyframe_id not in depths:
-            return None
-        pairs = estimate.pairs.take(estimate.pairs.slot == int(np.argmax(estimate.per_keyframe)))
-        seen, inliers = query.seen_xy[pairs.query], keyframe.view.seen_xy[pairs.keypoint]
-        pose = estimate.world_from_camera
-        found.append(likeness_by_depth(query, depths[keyframe.keyframe_id], pose, seen, inliers))
-    if found[0] is None or found[1] is None:
+    first, second = alike_of(own, with_depth), alike_of(other, with_depth)
+    if first is None or second is None:
         return None
-    return Alike(min(found[0][0], found[1][0]), (found[0][1] + found[1][1]) / 2)
+    return Alike(min(first.about, second.about), (first.in_all + second.in_all) / 2)
 
 
 def fallback_numbers(

@@ -24,7 +24,7 @@ from semdb.localization.edges import PlacedEdges
 from semdb.localization.fallback import Fallback, fallback_cache
 from semdb.localization.landmark_pose import MapLandmarks
 from semdb.localization.map_landmarks import read_map_landmarks
-from semdb.localization.shape_cache import Local, ShapeCache, There, edge_cache, surface_cache
+from semdb.localization.shape_cache import Local, ShapeCache, There, depth_cache, edge_cache, surface_cache
 from semdb.localization.surface_alignment import PlacedSurfaces
 from semdb.localization.views import ClassNumbers, KeyframeView, make_keyframe_view
 from semdb.recordings.images import decode_color_grey, has_size
@@ -57,6 +57,7 @@ class KeyframeCache:
         self._surfaces, self._edges = surface_cache(store), edge_cache(store)
         self.fallback = fallback
         self._others = None if fallback is None else fallback_cache(store, fallback, self.numbers)
+        self._depths = depth_cache(store)
         self._landmarks: MapLandmarks | None = None
         self._landmarks_read = False
         self._refined = refined
@@ -86,7 +87,7 @@ class KeyframeCache:
         self._pose_errors = None
         self._landmarks, self._landmarks_read = None, False
         gone = None if change.everything else change.added | change.gone
-        for shapes in (self._surfaces, self._edges):
+        for shapes in (self._surfaces, self._edges, self._depths):
             shapes.forget(gone)
         if self._others is not None:
             self._others.forget(gone)
@@ -134,6 +135,16 @@ class KeyframeCache:
                 view = self._others.placed(own.keyframe_id, own.world_from_camera)
             if view is not None:
                 found.append(replace(view, pose_sigma=own.pose_sigma, pose_errors=own.pose_errors))
+        return found
+
+    def with_depth(self, keyframe_ids: Sequence[int]) -> list[KeyframeView]:
+        """As `views`, with the inverse depth of their small images; a keyframe without depth is left out."""
+        found = []
+        for own in self.views(keyframe_ids):
+            with self._turn:
+                depth = self._depths.placed(own.keyframe_id, own.world_from_camera)
+            if depth is not None:
+                found.append(replace(own, view=replace(own.view, inverse_depth=depth.inverse)))
         return found
 
     def _load(self, missing: Sequence[int]) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from semdb.class_score import strengths
 from semdb.database.planning import check_models
 from semdb.errors import NotFoundError
+from semdb.localization.alike import LearnedVerdictOptions, alike_of, weigh_learned
 from semdb.localization.blurred import BlurOptions, BlurredKeyframes, blurred_query, extractor_for
 from semdb.localization.coarse import (
     Batch,
@@ -83,6 +84,7 @@ class LocalizerOptions:
     edges: EdgeVerdictOptions | None = field(default_factory=EdgeVerdictOptions)  # where neither convinces
     blur: BlurOptions | None = field(default_factory=BlurOptions)  # of a query that motion has blurred
     landmarks: LandmarkPoseOptions | None = field(default_factory=LandmarkPoseOptions)  # where keypoints fail
+    learned: LearnedVerdictOptions | None = None  # of a map of learned features; `for_models` sets it
     fallback: bool = True  # whether the other feature is asked that settings name, where keypoints do not convince
     recorded_errors: bool = True  # whether covariances count by how far recorded poses are off
     accept: Tolerance | None = None  # how far poses may differ that are one, where a query does not say
@@ -96,7 +98,8 @@ class LocalizerOptions:
         """The same with the thresholds that the local feature among `models` needs."""
         if not is_learned(models):
             return self
-        return replace(self, pose=replace(self.pose, matching=for_learned(self.pose.matching)))
+        pose = replace(self.pose, matching=for_learned(self.pose.matching))
+        return replace(self, pose=pose, learned=self.learned or LearnedVerdictOptions())
 
 
 class Localizer:
@@ -236,6 +239,7 @@ class Localizer:
         if damaged and not search.keyframes:
             raise self.cache.left_out[damaged[0]]
         convinced, judgement, evidence = self._settle(search)
+        judgement = self._look(search, judgement)
         if judgement.verdict is not Verdict.LOCALIZED and self.cache.fallback is not None:
             search, convinced, judgement, evidence = self._ask_fallback(
                 search, self.cache.fallback, description, (convinced, judgement, evidence)
@@ -271,6 +275,16 @@ class Localizer:
                 search.others.append(rival)
         search.timing_ms["pose"] += _ms_since(started)
         return convinced, judge(evidence, bounds), evidence
+
+    def _look(self, search: Search, judgement: Judgement) -> Judgement:
+        """What a learned feature says counts where the query looks like it."""
+        seen = best_of(search)
+        if self.options.learned is None or seen is None or judgement.verdict is not Verdict.LOCALIZED:
+            return judgement
+        started = time.perf_counter()
+        search.alike = alike_of(seen, self.cache.with_depth)
+        search.timing_ms["pose"] += _ms_since(started)
+        return weigh_learned(judgement, search.alike, self.options.learned)
 
     def _ask_fallback(
         self, search: Search, fallback: Fallback, description: Description, settled: Settled

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from semdb.localization.alike import Alike
 from semdb.localization.blurred import BlurredKeyframes
 from semdb.localization.coarse import Proposal, Stage
 from semdb.localization.confidence import Evidence, gather_evidence
@@ -37,6 +38,7 @@ class Search:
     estimate: PoseEstimate | None = None
     fallback: str = ""  # the feature that `query` and `keyframes` are of, where it is not the map's
     fallback_numbers: dict[str, float] = field(default_factory=dict)  # what another feature said
+    alike: Alike | None = None  # by measured depth, of a learned feature
     following: tuple[Proposal, ...] = ()
     stage: str = Stage.FILTERED
     ranked: int = 0
@@ -48,6 +50,8 @@ def numbers_of(search: Search, evidence: Evidence | None) -> dict[str, float]:
     found = evidence.as_mapping() if evidence else {}
     for laid in search.laid:
         found |= laid.numbers
+    if search.alike is not None:
+        found |= {"alike": search.alike.about, "alike_in_all": search.alike.in_all}
     found |= search.fallback_numbers
     return found | (search.by_landmarks.as_mapping() if search.by_landmarks else {})
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
@@ -12,6 +13,7 @@ from semdb.database.records import StoredKeyframe
 from semdb.database.store import Store
 from semdb.errors import CodecError, FrameError, NotFoundError
 from semdb.localization.edges import PlacedEdges, SpaceEdges, space_edges
+from semdb.localization.likeness import small_inverse_depth
 from semdb.localization.surface_alignment import PlacedSurfaces, place
 from semdb.localization.surfaces import Surfaces, surfaces_of
 from semdb.recordings.images import decode_color_grey
@@ -19,6 +21,7 @@ from semdb.recordings.registration import decode_registered_depth
 from semdb.types import Float32Array, FloatArray, ImageArray
 
 CAPACITY = 32  # keyframes; about 4 MiB each of surfaces, 0.4 of edges
+DEPTHS = 128  # of 0.13 MiB each
 
 
 class Placed(Protocol):
@@ -97,3 +100,21 @@ def surface_cache(store: Store) -> ShapeCache[Surfaces, PlacedSurfaces]:
 def edge_cache(store: Store) -> ShapeCache[SpaceEdges, PlacedEdges]:
     """Of the edges that a query's are laid on."""
     return ShapeCache(store, lambda stored, depth, grey: space_edges(stored.camera, depth, grey), PlacedEdges.at)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedDepth:
+    """One over the depth of a keyframe's small image ``[h, w]`` (1/m, NaN where there is none), and its pose."""
+
+    inverse: Float32Array
+    world_from_camera: FloatArray
+
+
+def depth_cache(store: Store) -> ShapeCache[Float32Array, PlacedDepth]:
+    """Of the depth by which a query is looked at."""
+    return ShapeCache(
+        store,
+        lambda stored, depth, grey: small_inverse_depth(stored.camera, depth),
+        lambda _, inverse, world_from_camera: PlacedDepth(inverse, world_from_camera),
+        DEPTHS,
+    )

@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 
 import semdb
+from semdb.cli.doctor import Check, sparse
 from semdb.database.store import open_store
 from semdb.errors import ModelError, UsageError
 from semdb.geometry import pose_error
 from semdb.ingestion.run import IngestOptions, ingest_recordings
+from semdb.localization.alike import Alike, LearnedVerdictOptions
 from semdb.localization.coarse import Batch, Proposal, Stage
 from semdb.localization.confidence import Evidence
-from semdb.localization.fallback import Alike, Fallback, FallbackOptions, asked_first, weigh_fallback
+from semdb.localization.fallback import Fallback, FallbackOptions, asked_first, weigh_fallback
 from semdb.localization.images import fallback_of, make_localizer
 from semdb.localization.localizer import Localizer, LocalizerOptions
 from semdb.localization.pose import PoseEstimate
@@ -24,7 +26,7 @@ from semdb.perception.describe import describer_from_specs
 from semdb.perception.features import load_features
 from semdb.recordings import open_recording
 from semdb.settings import Settings
-from semdb.types import Description, Features, ImageArray, ModelInfo, Tolerance, Verdict
+from semdb.types import Description, Features, ImageArray, Localization, ModelInfo, Tolerance, Verdict
 
 
 @pytest.fixture(scope="module")
@@ -190,3 +192,39 @@ def test_both_features_have_to_be_sure_together(room: Path, url: str) -> None:
     assert weigh(anew=replace(evidence, inliers=19)) is None
     assert weigh(before=moved) is None
     assert weigh(before=moved, accept=Tolerance(0.3, 5.0)) is not None
+
+
+def test_learned_features_are_believed_where_the_query_looks_alike(room: Path, url: str) -> None:
+    description, _ = described(room, 4)
+
+    def asked(learned: LearnedVerdictOptions | None) -> Localization:
+        return localizer(url, Counting(), LocalizerOptions(fallback=False, learned=learned)).localize(description)
+
+    plain, found = asked(None), asked(LearnedVerdictOptions())
+    assert "alike" not in plain.evidence
+    assert found.verdict is plain.verdict is Verdict.LOCALIZED
+    np.testing.assert_array_equal(found.world_from_camera, plain.world_from_camera)
+    assert found.confidence == plain.confidence
+    assert found.evidence["alike"] > 0.95
+    assert found.evidence["alike_in_all"] > 0.85
+    unlike = asked(LearnedVerdictOptions(least_about=1.01))
+    assert unlike.verdict is Verdict.AMBIGUOUS
+    assert unlike.confidence <= 0.5
+    assert "of what is about the pairs looks alike, " in unlike.reason
+
+
+def test_doctor_says_where_it_would_help(url: str, tmp_path: Path, room: Path) -> None:
+    made = f"sqlite:///{tmp_path / 'few.sqlite3'}"
+    settings = Settings(database_url=made, detector="recorded", encoder="gist", features="orb", threads=1)
+    ingest_recordings([room], settings, IngestOptions(stride=6, map_name="few"))
+
+    def said(url: str, settings: Settings) -> list[Check]:
+        with open_store(url) as store:
+            return list(sparse(store.engine, settings))
+
+    [found] = said(made, Settings())
+    assert (found.state, found.what) == ("info", "map few")
+    assert "far apart (to the nearest " in found.text
+    assert "SEMDB_FEATURES_FALLBACK=onnx:FILE" in found.text
+    assert said(made, Settings(features_fallback="sift")) == []
+    assert said(url, Settings()) == []

@@ -11,15 +11,17 @@ import pytest
 
 from semdb.cli.doctor import learned
 from semdb.errors import ModelError, UsageError
+from semdb.localization.alike import Alike, LearnedVerdictOptions, weigh_learned
 from semdb.localization.images import fallback_of
 from semdb.localization.learned_matching import for_learned, is_learned, match_by
 from semdb.localization.localizer import LocalizerOptions
 from semdb.localization.matching import Evidence, MatchingOptions, match_keypoints
+from semdb.localization.verdict import Judgement
 from semdb.localization.views import ClassNumbers, View, make_view
 from semdb.perception.features import load_features
 from semdb.perception.matchers import OnnxMatcher, load_matcher
 from semdb.settings import Settings
-from semdb.types import Camera, Features, Keypoints, ModelInfo
+from semdb.types import Camera, Features, Keypoints, ModelInfo, Verdict
 from tests.unit.onnx_files import write_constant_model
 
 SETTINGS = Settings(threads=1, device="cpu")
@@ -132,10 +134,31 @@ def replace_settings(**changed: str) -> Settings:
 def test_thresholds_follow_the_feature() -> None:
     surf = ModelInfo("features", "surf", "")
     assert LocalizerOptions().for_models([surf]) == LocalizerOptions()
-    learned = LocalizerOptions().for_models([ModelInfo("features", "onnx:x.onnx", "0")]).pose.matching
+    options = LocalizerOptions().for_models([ModelInfo("features", "onnx:x.onnx", "0")])
+    assert LocalizerOptions().learned is None
+    assert options.learned == LearnedVerdictOptions()
+    learned = options.pose.matching
     assert learned == for_learned(MatchingOptions())
     assert learned.ceiling < MatchingOptions().ceiling
     assert for_learned(MatchingOptions(evidence=Evidence.OBJECTS)).evidence is Evidence.OBJECTS
+
+
+@pytest.mark.parametrize(
+    ("alike", "verdict", "confidence"),
+    [
+        (Alike(0.81, 0.48), Verdict.LOCALIZED, 0.97),
+        (Alike(0.79, 0.9), Verdict.AMBIGUOUS, 0.5),  # shapes agree, what is on them does not
+        (Alike(0.95, 0.46), Verdict.AMBIGUOUS, 0.5),  # a thing is there, the rest is another place
+        (None, Verdict.LOCALIZED, 0.97),  # a keyframe without depth
+    ],
+)
+def test_what_is_learned_counts_where_the_query_looks_alike(
+    alike: Alike | None, verdict: Verdict, confidence: float
+) -> None:
+    found = weigh_learned(Judgement(Verdict.LOCALIZED, 0.97, "so many agree"), alike, LearnedVerdictOptions())
+    assert (found.verdict, found.confidence) == (verdict, confidence)
+    doubt = Judgement(Verdict.AMBIGUOUS, 0.4, "in doubt")
+    assert weigh_learned(doubt, alike, LearnedVerdictOptions()) == doubt
 
 
 def test_a_ceiling_refuses_what_is_nearest_but_unlike() -> None:
