@@ -48,14 +48,13 @@ from semdb.localization.pose import (
     recorded_covariance,
 )
 from semdb.localization.pose_options import PoseOptions
-from semdb.localization.search import Search, best_of, best_pairs, evidence_of, numbers_of
+from semdb.localization.search import Search, best_of, best_pairs, candidates_of, evidence_of, numbers_of
 from semdb.localization.sources import TimedSource
 from semdb.localization.surface_step import SurfaceVerdictOptions
 from semdb.localization.verdict import Judgement, VerdictOptions, convinces, judge
 from semdb.localization.views import View, in_kind_of, make_view
 from semdb.perception.quality import complaint_of, image_quality, motion_blur
 from semdb.types import (
-    Candidate,
     Description,
     FloatArray,
     Localization,
@@ -409,7 +408,7 @@ class Localizer:
             confidence=judgement.confidence,
             inliers=0 if search.estimate is None else search.estimate.inliers,
             stage=search.stage,
-            candidates=self._candidates(search, inliers),
+            candidates=candidates_of(search, inliers, self.cache.name_of),
             ranked_share=search.ranked / search.keyframes_in_map,
             keyframes_matched=len(search.keyframes),
             reason=judgement.reason,
@@ -426,19 +425,6 @@ class Localizer:
         if estimate is None:
             return None
         return recorded_covariance(estimate) if self.options.recorded_errors else estimate.covariance
-
-    def _candidates(self, search: Search, inliers: dict[int, int]) -> tuple[Candidate, ...]:
-        return tuple(
-            Candidate(
-                keyframe_id=proposal.keyframe_id,
-                recording=self.cache.name_of(proposal.keyframe_id)[0],
-                frame_index=self.cache.name_of(proposal.keyframe_id)[1],
-                class_score=proposal.class_score,
-                cosine=proposal.cosine,
-                inliers=inliers.get(proposal.keyframe_id, 0),
-            )
-            for proposal in search.proposals
-        )
 
 
 def _ms_since(started: float) -> float:

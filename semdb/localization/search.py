@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from semdb.localization.alike import Alike
@@ -14,7 +15,7 @@ from semdb.localization.matching import Matches
 from semdb.localization.pose import FirstPose, PoseEstimate
 from semdb.localization.pose_options import PoseOptions
 from semdb.localization.views import KeyframeView, View
-from semdb.types import ConsistentPose, Float32Array, Tolerance
+from semdb.types import Candidate, ConsistentPose, Float32Array, Tolerance
 
 Best = tuple[View, KeyframeView, PoseEstimate]
 
@@ -80,3 +81,23 @@ def best_pairs(
     slot = next(s for s, keyframe in enumerate(search.keyframes) if keyframe.keyframe_id == best)
     pairs = estimate.pairs.take(estimate.pairs.slot == slot)
     return search.query.seen_xy[pairs.query], search.keyframes[slot].view.seen_xy[pairs.keypoint]
+
+
+def candidates_of(
+    search: Search, inliers: Mapping[int, int], name_of: Callable[[int], tuple[str, int]]
+) -> tuple[Candidate, ...]:
+    """The keyframes that were proposed, with `inliers` by id; `name_of` gives recording and frame index of one."""
+    found = []
+    for proposal in search.proposals:
+        recording, frame_index = name_of(proposal.keyframe_id)
+        found.append(
+            Candidate(
+                keyframe_id=proposal.keyframe_id,
+                recording=recording,
+                frame_index=frame_index,
+                class_score=proposal.class_score,
+                cosine=proposal.cosine,
+                inliers=inliers.get(proposal.keyframe_id, 0),
+            )
+        )
+    return tuple(found)
