@@ -8,6 +8,7 @@ functions; `semdb --help` must stay instant.
 from __future__ import annotations
 
 import errno
+import gc
 import importlib
 import io
 import os
@@ -237,6 +238,8 @@ def main() -> None:
         app(prog_name="semdb")
     except KeyboardInterrupt as error:  # before a command began
         sys.exit(report(error))
+    finally:
+        gc.freeze()  # looking through all modules for cycles as they go took 0.3 s at the end of every command
 
 
 if __name__ == "__main__":

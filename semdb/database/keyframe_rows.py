@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from semdb.database import checked
 from semdb.database.codecs import decode_descriptors, decode_keypoints, keypoint_rows
+from semdb.database.columns import POSE_COLUMNS
 from semdb.database.records import KeyframeHead, StoredKeyframe, StoredObject
-from semdb.database.tables import POSE_COLUMNS
 from semdb.errors import CodecError, UsageError
 from semdb.geometry import (
     FARTHEST_POSE_M,

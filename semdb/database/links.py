@@ -10,17 +10,11 @@ from sqlalchemy import Connection, Engine, and_, delete, insert, or_, select
 
 from semdb.database import checked, retry
 from semdb.database.codecs import decode_array, encode_array
+from semdb.database.columns import POSE_COLUMNS
 from semdb.database.keyframe_rows import pose_columns, pose_of
 from semdb.database.pose_records import Link, LinkKind, LinkState
 from semdb.database.reading import Bad
-from semdb.database.tables import (
-    POSE_COLUMNS,
-    keyframes,
-    loop_closures,
-    planned_links,
-    pose_covariances,
-    recordings,
-)
+from semdb.database.tables import keyframes, loop_closures, planned_links, pose_covariances, recordings
 from semdb.errors import CodecError, UsageError
 from semdb.storable_names import NAME_LENGTH
 from semdb.types import FloatArray

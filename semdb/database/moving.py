@@ -17,6 +17,7 @@ from sqlalchemy import ColumnElement, Connection, Engine, bindparam, delete, fun
 from sqlalchemy.exc import IntegrityError
 
 from semdb.database import retry
+from semdb.database.columns import POSE_COLUMNS
 from semdb.database.ids import check_name, new_id
 from semdb.database.keyframe_rows import pose_columns, pose_of
 from semdb.database.links import write_covariances, write_links
@@ -30,7 +31,6 @@ from semdb.database.pose_records import (
 from semdb.database.pose_sources import poses_of, source_row
 from semdb.database.records import ChangeKind, ItemState, RecordingState
 from semdb.database.tables import (
-    POSE_COLUMNS,
     ingest_items,
     keyframe_categories,
     keyframe_changes,

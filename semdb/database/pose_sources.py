@@ -13,18 +13,11 @@ import numpy as np
 from sqlalchemy import Connection, Engine, and_, insert, select
 
 from semdb.database import checked, retry
+from semdb.database.columns import POSE_COLUMNS
 from semdb.database.keyframe_rows import pose_columns, pose_of
 from semdb.database.links import MOST_MATRIX, link_row, matrix_blob, matrix_of
 from semdb.database.pose_records import Link, PlannedPoses, PoseSource, RecordingPoses, World
-from semdb.database.tables import (
-    POSE_COLUMNS,
-    map_models,
-    maps,
-    planned_links,
-    planned_poses,
-    pose_sources,
-    recordings,
-)
+from semdb.database.tables import map_models, maps, planned_links, planned_poses, pose_sources, recordings
 from semdb.errors import UsageError
 from semdb.types import FloatArray
 

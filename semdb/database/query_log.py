@@ -11,8 +11,9 @@ from sqlalchemy import ColumnElement, Engine, and_, delete, func, not_, or_, sel
 
 from semdb.database import checked, retry
 from semdb.database.clock import now_plus
+from semdb.database.columns import POSE_COLUMNS
 from semdb.database.keyframe_rows import pose_of
-from semdb.database.tables import POSE_COLUMNS, maps, queries
+from semdb.database.tables import maps, queries
 from semdb.errors import CodecError, NotFoundError
 from semdb.types import FloatArray
 

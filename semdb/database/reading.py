@@ -12,10 +12,10 @@ from sqlalchemy.sql.elements import ColumnElement
 
 from semdb.database import checked, retry
 from semdb.database.codecs import decode_mask, decode_vectors
+from semdb.database.columns import POSE_COLUMNS
 from semdb.database.keyframe_rows import KeyframeRows, heads_of, keyframe_of, usable_poses
 from semdb.database.records import KeyframeHead, StoredImage, StoredKeyframe
 from semdb.database.tables import (
-    POSE_COLUMNS,
     cameras,
     categories,
     cnn_vectors,

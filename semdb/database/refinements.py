@@ -15,21 +15,13 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.sql.elements import ColumnElement
 
 from semdb.database import checked, retry
+from semdb.database.columns import POSE_COLUMNS
 from semdb.database.exact_sums import exact_sum, whole
 from semdb.database.keyframe_rows import FARTHEST_POINT_M, pose_of
 from semdb.database.point_rows import listed_keyframes
 from semdb.database.reading import Bad
 from semdb.database.records import ClassConfusion, MapObject, Refinement
-from semdb.database.tables import (
-    POSE_COLUMNS,
-    categories,
-    class_confusions,
-    keyframes,
-    maps,
-    objects,
-    recordings,
-    refinements,
-)
+from semdb.database.tables import categories, class_confusions, keyframes, maps, objects, recordings, refinements
 from semdb.errors import CodecError, NotFoundError
 from semdb.geometry import FARTHEST_POSE_M
 

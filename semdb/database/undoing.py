@@ -11,6 +11,7 @@ from sqlalchemy import Connection, Engine, delete, func, insert, select, update
 from sqlalchemy.exc import IntegrityError
 
 from semdb.database import checked, retry
+from semdb.database.columns import POSE_COLUMNS
 from semdb.database.ids import new_id
 from semdb.database.keyframe_rows import pose_of
 from semdb.database.links import matrix_blob, matrix_of
@@ -26,7 +27,6 @@ from semdb.database.pose_records import (
 )
 from semdb.database.pose_sources import poses_of, turned
 from semdb.database.tables import (
-    POSE_COLUMNS,
     keyframes,
     loop_closures,
     map_models,

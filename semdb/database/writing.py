@@ -22,6 +22,7 @@ from semdb.database.codecs import (
     encode_mask,
     image_format,
 )
+from semdb.database.columns import STRENGTH_COLUMNS
 from semdb.database.engine import check_packet
 from semdb.database.ids import SharedIds, new_id
 from semdb.database.items import Claim, held_by
@@ -261,7 +262,7 @@ def _category_rows(
             "model_id": model_id,
             "map_id": map_id,
             "count": counts.get(name, 0),
-            **dict(zip(tables.STRENGTH_COLUMNS, (*found.get(name, (0, 0)), held), strict=True)),
+            **dict(zip(STRENGTH_COLUMNS, (*found.get(name, (0, 0)), held), strict=True)),
         }
         for name in sorted({*counts, *found})
     ]
