@@ -11,7 +11,7 @@ semdb_password() {
 # All tables and views but the tokens and jobs of the service; CREATE lets rights be given before there is a table.
 semdb_readable() {
   for table in \
-    alembic_version cameras categories class_confusions cnn_vectors descriptors ingest_items \
+    alembic_version cameras categories class_confusions cnn_vectors descriptors frame_views ingest_items \
     keyframe_categories keyframe_changes keyframe_images keyframe_qualities keyframes keypoints \
     landmark_merges landmark_relations landmark_sightings landmark_views landmark_visits landmarks \
     loop_closures map_gravity map_models maps models object_features objects planned_links planned_poses \

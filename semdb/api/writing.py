@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:  # the rooms behind are entered when something is asked of the
     from semdb.database.pose_records import PoseOperation
     from semdb.door.protocol import Source
     from semdb.evaluation.runner import EvaluateOptions, Outcome
+    from semdb.ingestion.frames import FramesAdded
     from semdb.ingestion.queue import Send
     from semdb.ingestion.redescribe import Redescribed
     from semdb.ingestion.run import IngestOptions, IngestSummary, Progress
@@ -195,6 +197,38 @@ class Writing(Reading):
         if first is not None:
             raise first
         return results
+
+    def add_frames(
+        self,
+        source: str | PathLike[str] | Sequence[str | PathLike[str]],
+        *,
+        map: str | None = None,
+        camera: CameraLike | None = None,
+        reading: ReadOptions | None = None,
+        progress: Progress | None = None,
+    ) -> list[FramesAdded]:
+        """Keeps what frames beside the keyframes show, of recordings that were ingested (`semdb refine --frames`).
+
+        `source`, `camera` and `reading` are as for `ingest`; `map` names the map where recordings are in several. What
+        is there of a recording is replaced. Raises UsageError where no map holds a recording, RecordingError where it
+        brings no poses or is another one, ModelError, DatabaseError.
+        """
+        from semdb.api.sources import ingest_options, open_source
+        from semdb.ingestion.frames import add_frames, map_with
+        from semdb.ingestion.run import describers_for
+
+        options = ingest_options(map, None, None, None, camera, reading)
+        found = []
+        with open_source(source, self.settings, options, progress, self._check_ingest) as recordings:
+            store = self._store()
+            for recording in recordings:
+                info = map_with(store, recording, map)
+                with self._here.describers() as known:
+                    has_masks = recording.categories is not None
+                    _, own = describers_for(info.name, has_masks, store, self.settings, known)
+                    dtype = self.settings.descriptor_dtype
+                    found.append(add_frames(store, info, recording, own[0], dtype=dtype, progress=progress))
+        return found
 
     def tell_up(self, map: str, up: Sequence[float] | None) -> None:
         """Notes which way is up in a map, for `refine` from then on; None: it is estimated again.

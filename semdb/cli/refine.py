@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -23,6 +24,14 @@ def command(
         str | None,
         typer.Option("--up", metavar="X,Y,Z", help="Which way is up in the map, or `estimate`; kept from then on."),
     ] = None,
+    frames: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--frames",
+            metavar="RECORDING",
+            help="A recording that was ingested: its other frames are seen from nearer. Nothing else; repeatable.",
+        ),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Also what is up to date.")] = False,
     json: JsonFlag = False,
 ) -> None:
@@ -37,6 +46,9 @@ def command(
     from semdb.refinement.run import steps_of
 
     steps_of(step or ())
+    if frames:
+        _add_frames(overrides, map_name, frames, step, up, json)
+        return
     done: list[dict[str, Any]] = []
     failed: list[SemdbError] = []
     with open_database(overrides.settings()) as database:
@@ -74,6 +86,27 @@ def command(
         say("there is no keyframe to refine: ingest a recording first")
     if failed:
         raise typer.Exit(failed[0].exit_code)
+
+
+def _add_frames(
+    overrides: Overrides, map_name: str | None, paths: list[Path], step: list[str] | None, up: str | None, json: bool
+) -> None:
+    """What frames beside the keyframes show. Raises UsageError."""
+    from semdb.cli.output import print_json, print_lines
+    from semdb.cli.progress import StagedProgress, say
+    from semdb.errors import UsageError
+
+    if step or up:
+        raise UsageError("--frames does nothing else: leave out --step and --up")
+    with open_database(overrides.settings()) as database, StagedProgress(usual="frames") as progress:
+        found = database.add_frames([str(path) for path in paths], map=map_name, progress=progress.update)
+    for one in found:
+        for line in one.failed:
+            say(f"left out: {line}")
+        if not json:
+            print_lines(f"{one.recording}: {one.frames} frames beside {one.keyframes} keyframes")
+    if json:
+        print_json([{"recording": one.recording, "frames": one.frames, "keyframes": one.keyframes} for one in found])
 
 
 def _tell_up(database: Database, map_name: str | None, up: str) -> None:

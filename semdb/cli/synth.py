@@ -41,6 +41,14 @@ def command(
     plain: Annotated[
         bool, typer.Option("--plain", help="Everything in one colour each, but for one picture: hardly any texture.")
     ] = False,
+    bare: Annotated[
+        bool, typer.Option("--bare", help="As --plain, without small things and in colours that differ little.")
+    ] = False,
+    focal: Annotated[float, typer.Option(help="Focal length over the width: smaller is a wider lens.")] = 0.82,
+    eye_height: Annotated[float, typer.Option(help="Metres of the camera above the floor.")] = 1.4,
+    backwards: Annotated[
+        bool, typer.Option("--backwards", help="The walk of the same --seed the other way round.")
+    ] = False,
 ) -> None:
     """Render a furnished room as a recording.
 
@@ -65,6 +73,10 @@ def command(
         lap_frames=lap_frames,
         person=person,
         plain=plain,
+        bare=bare,
+        focal=focal,
+        eye_height=eye_height,
+        backwards=backwards,
         missed=missed,
         confused=confused,
     )

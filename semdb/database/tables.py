@@ -251,6 +251,15 @@ refined_points = table(
     Column("data", Blob, nullable=False),
 )
 
+frame_views = table(
+    "frame_views",
+    reference("keyframe_id", "keyframes.id", primary_key=True),
+    Column("frame_index", Integer, primary_key=True, autoincrement=False),
+    *pose_columns(),
+    Column("count", Integer, nullable=False),
+    *(Column(name, Blob, nullable=False) for name in ("keypoints", "descriptors", "grey")),
+)
+
 pose_sources = table(
     "pose_sources",
     reference("recording_id", "recordings.id", primary_key=True),

@@ -136,7 +136,7 @@ class KeyframeWriter:
                 change = update(tables.recordings).where(tables.recordings.c.id == recording_id)
                 connection.execute(change.values(state=RecordingState.INGESTING.value))
             models = map_model_ids(connection, row.id)
-            return _Target(row.id, row.name, models, _dtype_of(connection, row.id))
+            return _Target(row.id, row.name, models, descriptor_dtype_of(connection, row.id))
 
         target = retry.write(self._engine, work)
         self._targets[recording_id] = target
@@ -207,7 +207,7 @@ def _check_description(description: Description) -> None:
         raise UsageError("the CNN vector of a description is one finite row")
 
 
-def _dtype_of(connection: Connection, map_id: int) -> str:
+def descriptor_dtype_of(connection: Connection, map_id: int) -> str:
     """How descriptors of float are stored in a map: as in its last keyframe, whole in a new map."""
     k, r, d = tables.keyframes.c, tables.recordings.c, tables.descriptors.c
     query = select(func.substr(d.data, 1, HEAD)).join(tables.keyframes, k.id == d.keyframe_id)

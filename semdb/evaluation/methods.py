@@ -13,6 +13,7 @@ from semdb.localization.verdict import VerdictOptions
 from semdb.training.pose_options import CNN_LSTM, POSENET, POSENET_4D
 
 SEMDB = "semdb"
+SEMDB_FRAMES = "semdb-frames"
 SIFT_REFERENCE = "sift-reference"
 ORACLE = "oracle"
 COLMAP = "colmap"
@@ -42,7 +43,8 @@ class Method:
     """`features` None takes those of the settings; `query_depth` gives queries their depth images.
 
     `network` is the kind of a network that is trained in the place to regress poses, on the keyframes of the map only
-    with `keyframes_only`, and otherwise on all frames that are not near a query.
+    with `keyframes_only`, and otherwise on all frames that are not near a query. With `frames` the map has what `semdb
+    refine --frames` adds, of frames that are not near a query.
     """
 
     name: str
@@ -52,6 +54,7 @@ class Method:
     query_depth: bool = False
     network: str | None = None
     keyframes_only: bool = False
+    frames: bool = False
 
 
 # The filter as the paper has it: keyframes that share half of the query's objects, by counts, and no others.
@@ -76,6 +79,11 @@ METHODS = {
     for method in (
         Method(SEMDB, "class filter, cosine, cascade; all keypoints with the objects as evidence"),
         Method(
+            SEMDB_FRAMES,
+            "as semdb with frames beside the keyframes (refine --frames), none of them near a query",
+            frames=True,
+        ),
+        Method(
             "cnn",
             "as semdb with the class filter and the class term off, the same number of keyframes matched",
             LocalizerOptions(coarse=CoarseOptions(use_classes=False)),
@@ -92,6 +100,7 @@ METHODS = {
                 refined_points=False,
                 surfaces=None,
                 edges=None,
+                by_depth=None,
                 blur=None,
                 landmarks=None,
                 fallback=False,
@@ -109,6 +118,7 @@ METHODS = {
                 refined_points=False,
                 surfaces=None,
                 edges=None,
+                by_depth=None,
                 blur=None,
                 landmarks=None,
                 fallback=False,
@@ -142,6 +152,11 @@ METHODS = {
             "semdb-no-edges",
             "as semdb without laying the edges of queries on those of the map",
             LocalizerOptions(edges=None),
+        ),
+        Method(
+            "semdb-no-likeness",
+            "as semdb without comparing by measured depth what query and keyframe show where keypoints are not sure",
+            LocalizerOptions(by_depth=None),
         ),
         Method(
             "semdb-no-fallback",

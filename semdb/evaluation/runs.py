@@ -6,16 +6,17 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
-from semdb.database.records import RowOptions
+from semdb.database.records import MapInfo, RowOptions
 from semdb.database.store import Store
-from semdb.errors import FrameError, RecordingError
+from semdb.errors import FrameError, RecordingError, UsageError
 from semdb.evaluation.baselines import SiftReference, nearest_in_pose
 from semdb.evaluation.colmap_method import ColmapReference
 from semdb.evaluation.failures import sharpness
-from semdb.evaluation.methods import COLMAP, ORACLE, SIFT_REFERENCE, TRIVIAL, Method
+from semdb.evaluation.methods import COLMAP, ORACLE, SEMDB_FRAMES, SIFT_REFERENCE, TRIVIAL, Method
 from semdb.evaluation.metrics import QueryResult, query_result, with_reach
 from semdb.evaluation.regression import (
     FIXED,
+    NEAR,
     PoseTraining,
     TrainedNetwork,
     always,
@@ -25,7 +26,8 @@ from semdb.evaluation.regression import (
     trained_network,
 )
 from semdb.evaluation.retrieval import FIRST, reach
-from semdb.evaluation.tasks import Part, Task
+from semdb.evaluation.tasks import REFINED, Part, Task
+from semdb.ingestion.frames import add_frames
 from semdb.ingestion.run import IngestOptions, ingest_recording
 from semdb.localization.images import fallback_of, make_localizer, with_matcher
 from semdb.localization.localizer import Localizer
@@ -304,12 +306,28 @@ def open_run(
             refine_map(store, store.find_map(map_name), kinds=kinds, progress=progress)
     options = replace(method.options.with_threads(describers.settings.threads), accept=accept)
     info = store.find_map(map_name)
+    if method.frames:
+        _add_frames(info, task, describer, store, progress)
+    else:
+        options = replace(options, frames=0)
     if method.features is None:  # those that name their feature name their matching too
         options = with_matcher(options, describers.settings, store.map_models(info.id))
     fallback = fallback_of(describers.settings, store.map_models(info.id)) if options.fallback else None
     localizer = make_localizer(store, info, coarse, options, fallback=fallback)
     run = OracleRun if method.name.startswith(ORACLE) else LocalizerRun
     return run(method, describer, localizer, query_depth or method.query_depth, store)
+
+
+def _add_frames(info: MapInfo, task: Task, describer: Describer, store: Store, progress: Progress | None) -> None:
+    """Frames beside the keyframes, but for queries and the two on each side of them. Raises UsageError."""
+    if task.truth == REFINED:
+        raise UsageError(f"{SEMDB_FRAMES} needs --truth given: only keyframes and queries have refined poses")
+    for part in task.keyframes:
+        name, order = part.recording.name, [entry.index for entry in part.recording.entries]
+        asked = {entry.index for other in task.queries if other.recording.name == name for entry in other.entries}
+        at = [n for n, index in enumerate(order) if index in asked]
+        near = {order[m] for n in at for m in range(max(0, n - NEAR), min(len(order), n + NEAR + 1))}
+        add_frames(store, info, part.recording, describer, without=near, progress=progress)
 
 
 def _fill(options: IngestOptions, task: Task, describer: Describer, store: Store, progress: Progress | None) -> None:

@@ -9,15 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from semdb.localization.likeness import likeness_by_depth
 from semdb.localization.pose import PoseEstimate
 from semdb.localization.verdict import Judgement
 from semdb.localization.views import KeyframeView, View
 from semdb.types import Verdict
 
-Seen = tuple[View, KeyframeView, PoseEstimate]  # a query, the keyframe with most inliers, the pose
+Seen = tuple[View, KeyframeView, PoseEstimate, int]  # a query, the keyframe with most inliers, the pose, its slot there
 WithDepth = Callable[[Sequence[int]], Sequence[KeyframeView]]  # keyframes of ids that have depth, with it
 
 NO_MORE_THAN = 0.5  # the confidence where something looks otherwise
@@ -44,11 +42,11 @@ class LearnedVerdictOptions:
 
 def alike_of(seen: Seen, with_depth: WithDepth) -> Alike | None:
     """How alike query and keyframe are about the pairs of the pose; None where they cannot be compared."""
-    query, keyframe, estimate = seen
+    query, keyframe, estimate, slot = seen
     found = with_depth([keyframe.keyframe_id])
     if not found:
         return None
-    pairs = estimate.pairs.take(estimate.pairs.slot == int(np.argmax(estimate.per_keyframe)))
+    pairs = estimate.pairs.take(estimate.pairs.slot == slot)
     pixels, theirs = query.seen_xy[pairs.query], keyframe.view.seen_xy[pairs.keypoint]
     shares = likeness_by_depth(query, found[0], estimate.world_from_camera, pixels, theirs)
     return None if shares is None else Alike(*shares)

@@ -100,7 +100,7 @@ def placed_view(keyframe_id: int, view: View, world_from_camera: FloatArray) -> 
 def asked_first(keyframes: Sequence[KeyframeView], pairs: Sequence[int]) -> list[list[int]]:
     """Ids of `keyframes` in the batches in which they are asked: those with most `pairs` ``[n]`` first."""
     order = np.argsort(-np.asarray([*pairs, *[0] * (len(keyframes) - len(pairs))]), kind="stable")
-    ids = [keyframes[n].keyframe_id for n in order]
+    ids = [keyframes[n].keyframe_id for n in order if keyframes[n].keyframe_id > 0]
     first = BATCHES[0]
     return [batch for batch in (ids[:first], ids[first : first + BATCHES[1]]) if batch]
 

@@ -83,7 +83,11 @@ def localizer_on(
         fallback = fallback or fallback_of(settings, models)
     options = options or LocalizerOptions()
     cache = KeyframeCache(
-        store, info.id, refined=options.refined_points, fallback=fallback if options.fallback else None
+        store,
+        info.id,
+        refined=options.refined_points,
+        fallback=fallback if options.fallback else None,
+        frames=options.frames > 0,
     )
     if say is not None and cache.points == STALE:
         say(f"map {info.name!r} has changed since semdb refine; its refined points are not used: run semdb refine")

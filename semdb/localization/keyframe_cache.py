@@ -22,6 +22,7 @@ from semdb.geometry.sensor import depth_noise
 from semdb.localization.coarse import MapChange
 from semdb.localization.edges import PlacedEdges
 from semdb.localization.fallback import Fallback, fallback_cache
+from semdb.localization.frame_cache import FrameCache
 from semdb.localization.landmark_pose import MapLandmarks
 from semdb.localization.map_landmarks import read_map_landmarks
 from semdb.localization.shape_cache import Local, ShapeCache, There, depth_cache, edge_cache, surface_cache
@@ -37,12 +38,19 @@ USED, STALE, NONE, OFF = "used", "stale", "none", "off"  # what becomes of its p
 class KeyframeCache:
     """Loads keyframes from the database and keeps the `capacity` last used (about 1.3 MiB each).
 
-    With `refined` their points are those of `semdb refine`, as long as these belong to what the map holds. Threads may
-    share it: they take turns.
+    With `refined` their points are those of `semdb refine`, as long as these belong to what the map holds, with
+    `frames` there are those that it keeps beside them. Threads may share it: they take turns.
     """
 
     def __init__(
-        self, store: Store, map_id: int, capacity: int = 64, *, refined: bool = True, fallback: Fallback | None = None
+        self,
+        store: Store,
+        map_id: int,
+        capacity: int = 64,
+        *,
+        refined: bool = True,
+        fallback: Fallback | None = None,
+        frames: bool = True,
     ) -> None:
         self.numbers = ClassNumbers()
         self._turn = threading.RLock()
@@ -55,6 +63,7 @@ class KeyframeCache:
         self._poses: tuple[list[int], FloatArray] | None = None
         self._stale: set[int] = set()  # keyframes whose poses are to be read again
         self._surfaces, self._edges = surface_cache(store), edge_cache(store)
+        self._frames = FrameCache(store, map_id, self.numbers) if frames else None
         self.fallback = fallback
         self._others = None if fallback is None else fallback_cache(store, fallback, self.numbers)
         self._depths = depth_cache(store)
@@ -85,6 +94,8 @@ class KeyframeCache:
                 self._views.clear()  # their points belong to the map as it was
             self._points = None
         self._pose_errors = None
+        if self._frames is not None:
+            self._frames.forget()
         self._landmarks, self._landmarks_read = None, False
         gone = None if change.everything else change.added | change.gone
         for shapes in (self._surfaces, self._edges, self._depths):
@@ -147,6 +158,18 @@ class KeyframeCache:
                 found.append(replace(own, view=replace(own.view, inverse_depth=depth.inverse)))
         return found
 
+    def frames_near(self, pose: FloatArray, limit: float, count: int) -> list[KeyframeView]:
+        """The `count` frames beside the keyframes that are nearest to `pose`, as `near`. Their ids are negative."""
+        if self._frames is None:
+            return []
+        with self._turn:
+            ids, poses = self._read_poses()
+            found = self._frames.near(pose, limit, count, dict(zip(ids, poses, strict=True)))
+            errors = self._known_errors()
+            return [
+                replace(one, pose_errors=errors.get(self._frames.head(one.keyframe_id).recording_id)) for one in found
+            ]
+
     def _load(self, missing: Sequence[int]) -> None:
         if not missing:
             return
@@ -174,12 +197,15 @@ class KeyframeCache:
 
     def _with_errors(self, view: KeyframeView) -> KeyframeView:
         """The same with what is known of its recording now, which may be measured after its keyframes were read."""
-        if self._pose_errors is None:
-            self._pose_errors = load_pose_errors(self.store.engine, self._map_id, lambda _, error: self._say(error))
-        errors = self._pose_errors.get(self._recordings[view.keyframe_id])
+        errors = self._known_errors().get(self._recordings[view.keyframe_id])
         if view.pose_errors != errors:
             view = self._views[view.keyframe_id] = replace(view, pose_errors=errors)
         return view
+
+    def _known_errors(self) -> dict[int, PoseErrors]:
+        if self._pose_errors is None:
+            self._pose_errors = load_pose_errors(self.store.engine, self._map_id, lambda _, error: self._say(error))
+        return self._pose_errors
 
     def _say(self, error: CodecError) -> None:
         if self.store.say is not None:

@@ -25,6 +25,7 @@ from semdb.localization.coarse import (
     retrieve,
 )
 from semdb.localization.confidence import Evidence
+from semdb.localization.depth_step import DepthVerdictOptions, only_unsure, weigh_unsure
 from semdb.localization.edge_step import EdgeVerdictOptions
 from semdb.localization.fallback import (
     Fallback,
@@ -79,8 +80,10 @@ class LocalizerOptions:
     neighbours: int = 2  # keyframes near the first pose that join once it convinces
     twins: int = 1  # keyframes far from the pose that are asked when they look as much like the query
     refined_points: bool = True  # those of `semdb refine`, where the map has not changed since
+    frames: int = 2  # beside keyframes (`semdb refine --frames`), near the first pose, that join
     surfaces: SurfaceVerdictOptions | None = field(default_factory=SurfaceVerdictOptions)  # of a query with depth
     edges: EdgeVerdictOptions | None = field(default_factory=EdgeVerdictOptions)  # where neither convinces
+    by_depth: DepthVerdictOptions | None = field(default_factory=DepthVerdictOptions)  # where keypoints are not sure
     blur: BlurOptions | None = field(default_factory=BlurOptions)  # of a query that motion has blurred
     landmarks: LandmarkPoseOptions | None = field(default_factory=LandmarkPoseOptions)  # where keypoints fail
     learned: LearnedVerdictOptions | None = None  # of a map of learned features; `for_models` sets it
@@ -98,7 +101,8 @@ class LocalizerOptions:
         if not is_learned(models):
             return self
         pose = replace(self.pose, matching=for_learned(self.pose.matching))
-        return replace(self, pose=pose, learned=self.learned or LearnedVerdictOptions())
+        # they find a room of the same shapes as well: what they are unsure of stays in doubt
+        return replace(self, pose=pose, learned=self.learned or LearnedVerdictOptions(), by_depth=None)
 
 
 class Localizer:
@@ -238,7 +242,7 @@ class Localizer:
         if damaged and not search.keyframes:
             raise self.cache.left_out[damaged[0]]
         convinced, judgement, evidence = self._settle(search)
-        judgement = self._look(search, judgement)
+        judgement = self._look(search, judgement, evidence)
         if judgement.verdict is not Verdict.LOCALIZED and self.cache.fallback is not None:
             search, convinced, judgement, evidence = self._ask_fallback(
                 search, self.cache.fallback, description, (convinced, judgement, evidence)
@@ -262,6 +266,7 @@ class Localizer:
         convinced = convinces(search.first, self.options.verdict) and search.stage != Stage.GIVEN
         if convinced:
             self._ask_neighbours(search)
+        convinced = self._ask_frames(search, convinced)
         self._estimate(search)
         if convinced:
             self._ask_twins(search)
@@ -275,15 +280,22 @@ class Localizer:
         search.timing_ms["pose"] += _ms_since(started)
         return convinced, judge(evidence, bounds), evidence
 
-    def _look(self, search: Search, judgement: Judgement) -> Judgement:
-        """What a learned feature says counts where the query looks like it."""
-        seen = best_of(search)
-        if self.options.learned is None or seen is None or judgement.verdict is not Verdict.LOCALIZED:
+    def _look(self, search: Search, judgement: Judgement, evidence: Evidence | None) -> Judgement:
+        """The verdict by what looks alike in query and best keyframe: of learned features, and where one is unsure."""
+        learned, unsure, seen = self.options.learned, self.options.by_depth, best_of(search)
+        bounds = self.options.verdict.accepting(search.accept)
+        if seen is None or evidence is None or search.blurred is not None:
+            return judgement
+        asked = judgement.verdict is Verdict.LOCALIZED and learned is not None
+        doubted = judgement.verdict is Verdict.AMBIGUOUS and unsure is not None
+        if not (asked or (doubted and unsure is not None and only_unsure(evidence, bounds, unsure))):
             return judgement
         started = time.perf_counter()
         search.alike = alike_of(seen, self.cache.with_depth)
         search.timing_ms["pose"] += _ms_since(started)
-        return weigh_learned(judgement, search.alike, self.options.learned)
+        if learned is not None and asked:
+            return weigh_learned(judgement, search.alike, learned)
+        return judgement if unsure is None else weigh_unsure(search.alike, evidence, judgement, bounds, unsure)
 
     def _ask_fallback(
         self, search: Search, fallback: Fallback, description: Description, settled: Settled
@@ -356,6 +368,24 @@ class Localizer:
             search.proposals += [Proposal(i, float("nan"), float("nan")) for i in chosen]
             self._match(search, chosen)
 
+    def _ask_frames(self, search: Search, convinced: bool) -> bool:
+        """Frames beside the keyframes may have seen it from nearer; whether the first pose convinces now."""
+        of = self.options
+        if search.first is None or not of.frames or search.fallback or search.stage == Stage.GIVEN:
+            return convinced
+        if search.blurred is not None:
+            return convinced
+        started = time.perf_counter()
+        found = self.cache.frames_near(search.first.world_from_camera, FAR, of.frames)
+        if found:
+            search.proposals += [Proposal(one.keyframe_id, float("nan"), float("nan")) for one in found]
+            search.keyframes += found
+            search.matches += match_views(search.query, found, search.pose)
+            if not convinced:
+                search.first = first_pose(search.query, search.keyframes, search.matches, search.pose)
+        search.timing_ms["match"] += _ms_since(started)
+        return convinced or (bool(found) and convinces(search.first, of.verdict))
+
     def _estimate(self, search: Search) -> None:
         """The last pose, of all that was matched; without the neighbours where these take support away."""
         if search.first is None:
@@ -398,7 +428,7 @@ class Localizer:
         if estimate is not None:
             ids = [keyframe.keyframe_id for keyframe in search.keyframes]
             inliers.update(zip(ids, estimate.per_keyframe, strict=False))
-        best = max(inliers, key=lambda i: inliers[i]) if estimate is not None else None
+        best = max((i for i in inliers if i > 0), key=lambda i: inliers[i]) if estimate is not None else None
         query_xy, keyframe_xy = best_pairs(search, estimate, best)
         return Localization(
             verdict=judgement.verdict,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
-from semdb.localization.alike import Alike
+from semdb.localization.alike import Alike, Seen
 from semdb.localization.blurred import BlurredKeyframes
 from semdb.localization.coarse import Proposal, Stage
 from semdb.localization.confidence import Evidence, gather_evidence
@@ -16,8 +16,6 @@ from semdb.localization.pose import FirstPose, PoseEstimate
 from semdb.localization.pose_options import PoseOptions
 from semdb.localization.views import KeyframeView, View
 from semdb.types import Candidate, ConsistentPose, Float32Array, Tolerance
-
-Best = tuple[View, KeyframeView, PoseEstimate]
 
 
 @dataclass(slots=True)
@@ -39,7 +37,7 @@ class Search:
     estimate: PoseEstimate | None = None
     fallback: str = ""  # the feature that `query` and `keyframes` are of, where it is not the map's
     fallback_numbers: dict[str, float] = field(default_factory=dict)  # what another feature said
-    alike: Alike | None = None  # by measured depth, of a learned feature
+    alike: Alike | None = None  # by measured depth, of a learned feature or where one is not sure
     following: tuple[Proposal, ...] = ()
     stage: str = Stage.FILTERED
     ranked: int = 0
@@ -63,13 +61,14 @@ def evidence_of(search: Search, estimate: PoseEstimate, rival: int) -> Evidence:
     return gather_evidence(search.query, search.keyframes, estimate, rival, known)
 
 
-def best_of(search: Search) -> Best | None:
-    """The query, the keyframe that has most inliers, and the pose; None where there is none."""
+def best_of(search: Search) -> Seen | None:
+    """The query, the keyframe that has most inliers, the pose, and its number there; None where there is none."""
     estimate = search.estimate
     if estimate is None:
         return None
-    best = max(range(len(estimate.per_keyframe)), key=estimate.per_keyframe.__getitem__)
-    return search.query, search.keyframes[best], estimate
+    own = (n for n in range(len(estimate.per_keyframe)) if search.keyframes[n].keyframe_id > 0)
+    best = max(own, key=estimate.per_keyframe.__getitem__)  # of frames beside keyframes no depth is kept
+    return search.query, search.keyframes[best], estimate, best
 
 
 def best_pairs(
@@ -89,6 +88,8 @@ def candidates_of(
     """The keyframes that were proposed, with `inliers` by id; `name_of` gives recording and frame index of one."""
     found = []
     for proposal in search.proposals:
+        if proposal.keyframe_id < 0:  # a frame beside keyframes
+            continue
         recording, frame_index = name_of(proposal.keyframe_id)
         found.append(
             Candidate(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from sqlalchemy import Engine, inspect, text
 import semdb.migrations
 from semdb.database import schema, tokens
 from semdb.database.engine import make_engine
+from semdb.database.frame_views import FrameHead, FrameRow, load_frame_heads, load_frames, write_frame_views
 from semdb.database.landmark_rows import load_gravity
 from semdb.database.links import list_links
 from semdb.database.pose_errors import load_pose_errors, replace_pose_errors
@@ -244,6 +246,31 @@ def test_recordings_of_before_have_no_measured_errors(engine: Engine, empty_url:
         assert row["rotation_deg"] == pytest.approx(0.2865, abs=1e-4)
         store.delete_recording(recording_id)
         assert load_pose_errors(engine, map_id) == {}
+
+
+def test_keyframes_of_before_have_no_frames_beside_them(engine: Engine, empty_url: str) -> None:
+    schema.upgrade(engine)
+    with open_store(empty_url) as store:
+        map_id, recording_id, ids = fill(store)
+    schema.downgrade(engine, "0014")
+    assert "frame_views" not in inspect(engine).get_table_names()
+    schema.upgrade(engine)
+    with open_store(empty_url) as store:
+        known = store.load_keyframes(ids)
+        assert len(known) == len(ids)
+        assert load_frame_heads(engine, map_id) == []
+        nowhere = np.full(len(known[0].keypoints), -1, np.int32)
+        keypoints = replace(known[0].keypoints, object_index=nowhere)
+        head = FrameHead(ids[0], 7, np.eye(4), known[0].camera, recording_id)
+        gone = replace(head, keyframe_id=max(ids) + 1000)
+        assert write_frame_views(engine, recording_id, [FrameRow(one, keypoints, b"grey") for one in (head, gone)]) == 1
+        [found] = load_frames(engine, load_frame_heads(engine, map_id))
+        assert (found.head.frame_index, found.head.camera, found.grey) == (7, known[0].camera, b"grey")
+        np.testing.assert_array_equal(found.head.keyframe_from_camera, np.eye(4))
+        np.testing.assert_array_equal(found.keypoints.points, keypoints.points)
+        np.testing.assert_array_equal(found.keypoints.features.descriptors, keypoints.features.descriptors)
+        store.delete_recording(recording_id)
+        assert load_frame_heads(engine, map_id) == []
 
 
 def test_a_database_of_before_gets_tokens(engine: Engine, empty_url: str) -> None:

@@ -291,3 +291,25 @@ def test_an_interrupted_run_leaves_nothing(tmp_path: Path) -> None:
 def test_options_out_of_range(change: dict[str, float]) -> None:
     with pytest.raises(UsageError, match=next(iter(change))):
         SyntheticOptions(**change)  # type: ignore[arg-type]
+
+
+def test_another_height_lens_and_direction_are_of_the_same_walk(sequence: SyntheticSequence) -> None:
+    low = SyntheticSequence(dataclasses.replace(SMALL, eye_height=0.9, focal=0.5))
+    np.testing.assert_allclose(sequence.poses[:, 2, 3] - low.poses[:, 2, 3], 0.5)
+    np.testing.assert_array_equal(sequence.poses[:, :2], low.poses[:, :2])
+    assert low.camera.fx == pytest.approx(0.5 * SMALL.width)
+    back = SyntheticSequence(dataclasses.replace(SMALL, backwards=True))
+    turns = [np.cross(s.poses[0][:3, 2], s.poses[1][:3, 2])[2] for s in (sequence, back)]  # of where it looks
+    assert turns[0] * turns[1] < 0
+    np.testing.assert_allclose(back.poses[0][:3, 3], sequence.poses[0][:3, 3], atol=0.6)
+
+
+def test_a_bare_room_has_nothing_small_and_hardly_a_colour(sequence: SyntheticSequence) -> None:
+    plain, bare = (
+        SyntheticSequence(dataclasses.replace(SMALL, **{name: True})).render(2) for name in ("plain", "bare")
+    )
+    kinds = {label: sequence.classes[label] for label in np.unique(bare.labels) if label}
+    assert not {"book", "cup", "bottle", "vase", "wine glass"} & set(kinds.values())
+    assert set(kinds) <= set(np.unique(sequence.render(2).labels))
+    saturation = [np.ptp(frame.rgb.astype(int), axis=2).mean() for frame in (plain, bare)]
+    assert saturation[1] < 0.75 * saturation[0]

@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from semdb.localization.alike import Alike
 from semdb.localization.confidence import Evidence, confidence_of, sigmas
+from semdb.localization.depth_step import DepthVerdictOptions, only_unsure, weigh_unsure
 from semdb.localization.pose import Pairs, PoseEstimate
 from semdb.localization.verdict import VerdictOptions, convinces, judge
 from semdb.types import Verdict
@@ -125,3 +127,25 @@ def test_sigma_is_that_of_the_worst_axis() -> None:
     assert metres == pytest.approx(0.03)
     assert degrees == pytest.approx(np.degrees(0.002))
     assert sigmas(None) == (float("inf"), float("inf"))
+
+
+DOUBTFUL = replace(EVIDENCE, agreement=0.42, likeness=0.55, aligned=0.3, query_share=0.1)
+
+
+def test_what_looks_alike_by_depth_stands_for_a_confidence_that_is_too_low() -> None:
+    options, judgement = DepthVerdictOptions(), judge(DOUBTFUL, OPTIONS)
+    assert judgement.verdict is Verdict.AMBIGUOUS
+    assert options.least_confidence < judgement.confidence < OPTIONS.localized_confidence
+    assert only_unsure(DOUBTFUL, OPTIONS, options)
+    found = weigh_unsure(Alike(0.91, 0.8), DOUBTFUL, judgement, OPTIONS, options)
+    assert (found.verdict, found.confidence) == (Verdict.LOCALIZED, OPTIONS.localized_confidence)
+    assert "80% of the keyframe looks alike" in found.reason
+    for alike in (Alike(0.8, 0.8), Alike(0.91, 0.6), None):
+        assert weigh_unsure(alike, DOUBTFUL, judgement, OPTIONS, options) is judgement
+
+
+@pytest.mark.parametrize(
+    "change", [{"rival": 60}, {"sigma_m": 0.07}, {"spread": 0.1}, {"inliers": 19}, {"agreement": 0.05, "likeness": 0.2}]
+)
+def test_any_other_doubt_stays_one_whatever_looks_alike(change: dict[str, float]) -> None:
+    assert not only_unsure(replace(DOUBTFUL, **change), OPTIONS, DepthVerdictOptions())  # type: ignore[arg-type]

@@ -8,6 +8,7 @@ from semdb.errors import UsageError
 from semdb.types import Camera
 
 FOCAL_PER_WIDTH = 0.82  # fx / width: 62.7 degrees from left to right, as the sensors of TUM RGB-D and 7-Scenes
+EYE_HEIGHT_M = 1.4  # of the camera above the floor, about which it goes up and down
 DEPTH_SCALE = 5000.0
 FRAME_RATE_HZ = 30.0
 BETWEEN_ROOMS_M = 20.0  # from the middle of one room of a building to that of the next
@@ -25,7 +26,10 @@ class SyntheticOptions:
     With `person` somebody walks to and fro before the camera.
     Rooms to be confused with others: `furniture_seed` puts the furniture of another seed into the room, `alike` mirrors
     every texture (same shapes, same colours, another room), `desks` furnishes it with so many equal workplaces.
-    `plain` paints everything in one colour each but for one picture on a wall: hardly any texture.
+    `plain` paints everything in one colour each but for one picture on a wall: hardly any texture. `bare`
+    besides leaves out all small things and gives the colours little contrast.
+    Other cameras: `focal` is the focal length over the width, `eye_height` the metres of the camera above the floor,
+    and `backwards` the walk of the same seed the other way round.
     `place` numbers the rooms of a building: each next one lies 20 m further along x in the world of the poses.
     Masks as a real detector's: of the instances of every frame a share `missed` is not there, and a share `confused`
     goes by the name of a class that detectors take it for.
@@ -45,11 +49,15 @@ class SyntheticOptions:
     furniture_seed: int | None = None
     alike: bool = False
     plain: bool = False
+    bare: bool = False
     desks: int = 0
     person: bool = False
     place: int = 0
     missed: float = 0.0
     confused: float = 0.0
+    focal: float = FOCAL_PER_WIDTH
+    eye_height: float = EYE_HEIGHT_M
+    backwards: bool = False
 
     def __post_init__(self) -> None:
         """Raises UsageError naming the option that makes no sense."""
@@ -68,6 +76,8 @@ class SyntheticOptions:
             ("place", 0, 100_000),
             ("missed", 0.0, 1.0),
             ("confused", 0.0, 1.0),
+            ("focal", 0.2, 3.0),
+            ("eye_height", 0.3, 2.0),
         )
         for name, low, high in limits:
             value = getattr(self, name)
@@ -77,5 +87,5 @@ class SyntheticOptions:
     @property
     def camera(self) -> Camera:
         """The pinhole camera that the recording is rendered with."""
-        focal = FOCAL_PER_WIDTH * self.width
+        focal = self.focal * self.width
         return Camera(self.width, self.height, focal, focal, (self.width - 1) / 2, (self.height - 1) / 2)

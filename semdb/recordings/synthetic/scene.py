@@ -15,6 +15,9 @@ from semdb.types import Float32Array, FloatArray, ImageArray
 BOX, FRUSTUM, ELLIPSOID, ROOM = 0, 1, 2, 3  # as in kernels.py, which imports numba and is loaded only to render
 MAX_LEVELS = 12
 TEXEL = 0.08  # metres per texel of baked light
+SMALL_RADIUS = 0.2  # metres: things up to that are small
+BARE_GREY = np.array([196.0, 192.0, 186.0])
+BARE_CONTRAST = 0.4
 Int64Array = npt.NDArray[np.int64]
 
 
@@ -82,8 +85,21 @@ def mirrored(items: Sequence[Item]) -> list[Item]:
     return _with_textures(items, turn)
 
 
-def plain(items: Sequence[Item]) -> list[Item]:
-    """`items` with every texture painted in its mean colour, but for those of the first picture on a wall."""
+def bare(items: Sequence[Item]) -> list[Item]:
+    """As `plain`, without small things and other pictures, and in colours that differ little."""
+    pictures = [item for item in items if item.is_picture]
+    kept = [
+        replace(item, prims=[]) if item in pictures[1:] or (item.category and item.radius <= SMALL_RADIUS) else item
+        for item in items
+    ]
+    return plain(kept, contrast=BARE_CONTRAST)
+
+
+def plain(items: Sequence[Item], contrast: float = 1.0) -> list[Item]:
+    """`items` with every texture painted in its mean colour, but for those of the first picture on a wall.
+
+    With less `contrast` (0..1) the colours are nearer to one grey.
+    """
     pictures = [item for item in items if item.is_picture]
     kept = {id(face.texture) for item in pictures[:1] for prim in item.prims for face in prim.faces}
     known: dict[int, Texture] = {}
@@ -92,7 +108,8 @@ def plain(items: Sequence[Item]) -> list[Item]:
         if id(texture) in kept:
             return texture
         if id(texture) not in known:
-            colour = np.rint(texture.image.reshape(-1, 3).mean(axis=0)).astype(np.uint8)
+            mean = texture.image.reshape(-1, 3).mean(axis=0)
+            colour = np.rint(BARE_GREY + contrast * (mean - BARE_GREY)).astype(np.uint8)
             known[id(texture)] = replace(texture, image=np.broadcast_to(colour, texture.image.shape).copy())
         return known[id(texture)]
 

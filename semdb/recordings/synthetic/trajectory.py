@@ -7,6 +7,7 @@ from scipy.interpolate import CubicSpline
 
 from semdb.errors import SemdbError
 from semdb.geometry import pose_from
+from semdb.recordings.synthetic.options import EYE_HEIGHT_M
 from semdb.recordings.synthetic.room import Room
 from semdb.types import FloatArray
 
@@ -33,21 +34,30 @@ def _free_radius(room: Room, angle: float) -> float:
     return float(r[blocked[0]] if len(blocked) else r[-1])
 
 
-def walk(room: Room, frames: int, lap_frames: int, seed: int, second_visit: bool) -> FloatArray:
+def walk(
+    room: Room,
+    frames: int,
+    lap_frames: int,
+    seed: int,
+    second_visit: bool,
+    eye_height: float = EYE_HEIGHT_M,
+    backwards: bool = False,
+) -> FloatArray:
     """Poses ``[frames, 4, 4]`` (world_from_camera).
 
     In `lap_frames` frames the camera walks once around the clear part of the room and turns by 360 degrees; further
-    laps are alike but not equal. Height 1.25 to 1.55 m, pitch and roll of a hand-held camera.
+    laps are alike but not equal. It is within 0.15 m of `eye_height`, with pitch and roll of a hand-held camera;
+    `backwards` goes the other way round.
     """
     rng = np.random.default_rng([seed, 3, int(second_visit)])
     laps = int(np.ceil(frames / lap_frames)) + 1
     knots = KNOTS * laps + 1
     share = np.tile(rng.uniform(0.5, 0.85, KNOTS), laps + 1)[:knots] + rng.uniform(-0.05, 0.05, knots)
-    sense = 1.0 if rng.random() < 0.5 else -1.0
+    sense = 1.0 if (rng.random() < 0.5) != backwards else -1.0
     start, look = rng.uniform(0, 2 * np.pi), rng.uniform(0.55 * np.pi, 1.45 * np.pi)  # looks across the room
     angle = start + sense * 2 * np.pi * (np.arange(knots) / KNOTS) + rng.uniform(-0.12, 0.12, knots)
     reach = np.array([_free_radius(room, a) for a in angle])
-    height = 1.4 + np.tile(rng.uniform(-0.13, 0.13, KNOTS), laps + 1)[:knots]
+    height = eye_height + np.tile(rng.uniform(-0.13, 0.13, KNOTS), laps + 1)[:knots]
     times = np.arange(frames) * KNOTS / lap_frames
     for shrink in 0.9 ** np.arange(20):
         radius = shrink * share * reach

@@ -26,7 +26,7 @@ from semdb.recordings.synthetic.person import CATEGORY as PERSON
 from semdb.recordings.synthetic.person import walker_for
 from semdb.recordings.synthetic.render import Lamp, bake_light, render_view
 from semdb.recordings.synthetic.room import Room, build_room
-from semdb.recordings.synthetic.scene import PackedScene, mirrored, pack, plain, yaw_pose
+from semdb.recordings.synthetic.scene import PackedScene, bare, mirrored, pack, plain, yaw_pose
 from semdb.recordings.synthetic.trajectory import walk
 from semdb.recordings.synthetic.visit import move_objects, take_away
 from semdb.types import Float32Array, FloatArray, ImageArray
@@ -54,6 +54,7 @@ def _scene(
     desks: int,
     alike: bool,
     is_plain: bool,
+    is_bare: bool,
     visit_seed: int | None,
     share_taken: float,
 ) -> tuple[Room, PackedScene, tuple[int, ...], tuple[int, ...]]:
@@ -64,7 +65,9 @@ def _scene(
         moved = move_objects(room, visit_seed, room_seed)
         taken = take_away(room, share_taken, visit_seed, room_seed)
     items = mirrored(room.items) if alike else room.items
-    if is_plain:
+    if is_bare:
+        items = bare(items)
+    elif is_plain:
         items = plain(items)
     kept = tuple(label for label in moved if label not in taken)
     return room, bake_light(pack(items), _lamps(room)), kept, tuple(taken)
@@ -88,12 +91,15 @@ class SyntheticSequence:
         self.camera = options.camera
         visit = options.seed if options.second_visit else None
         self.room, self._packed, self.moved, self.taken = _scene(
-            *(options.room_seed, options.furniture_seed, options.desks, options.alike, options.plain),
+            *(options.room_seed, options.furniture_seed, options.desks, options.alike, options.plain, options.bare),
             *(visit, options.taken),
         )
         self._walker = walker_for(self.room, options.seed) if options.person else None
         # one more pose than frames: the blur of the last frame needs where the camera goes next
-        poses = walk(self.room, options.frames + 1, options.lap_frames, options.seed, options.second_visit)
+        poses = walk(
+            self.room, options.frames + 1, options.lap_frames, options.seed, options.second_visit,
+            options.eye_height, options.backwards,
+        )  # fmt: skip
         self._poses = poses
         self.poses: FloatArray = poses[:-1].copy()
         self.poses[:, 0, 3] += BETWEEN_ROOMS_M * options.place

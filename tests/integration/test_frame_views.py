@@ -1,0 +1,161 @@
+"""`semdb refine --frames`: what frames beside the keyframes show, kept and used."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import semdb
+from semdb.cli.main import app
+from semdb.database.frame_views import FrameHead, FrameRow, load_frame_heads, load_frames, write_frame_views
+from semdb.database.store import Store, open_store
+from semdb.errors import RecordingError, UsageError
+from semdb.geometry import pose_error
+from semdb.ingestion.frames import add_frames
+from semdb.localization.images import make_localizer
+from semdb.localization.localizer import Localizer, LocalizerOptions
+from semdb.perception.describe import Describer, describer_from_specs
+from semdb.recordings import open_recording
+from semdb.settings import Settings
+from semdb.types import Verdict
+
+KEYFRAMES = 3
+
+
+@pytest.fixture(scope="module")
+def url(room: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    made = f"sqlite:///{tmp_path_factory.mktemp('frames') / 'semdb.sqlite3'}"
+    with semdb.open(made, detector="recorded", encoder="gist", features="surf", threads=1) as db:
+        db.ingest(room, map="room", keyframes=KEYFRAMES)
+        assert [(one.frames > 2, one.keyframes) for one in db.add_frames(room)] == [(True, KEYFRAMES)]
+    return made
+
+
+@pytest.fixture
+def store(url: str) -> Store:
+    return open_store(url)
+
+
+def describer() -> Describer:
+    return describer_from_specs("recorded", "gist", "surf", Settings(threads=1))
+
+
+def localizer(store: Store, frames: int) -> Localizer:
+    return make_localizer(store, store.find_map("room"), "sql", LocalizerOptions(frames=frames))
+
+
+def test_frames_lie_where_they_were_and_are_used(room: Path, store: Store) -> None:
+    recording = open_recording(room)
+    entries = {entry.index: entry for entry in recording.entries}
+    ids, poses = localizer(store, 2).cache.poses()
+    heads = load_frame_heads(store.engine, 1)
+    used = {head.frame_index for head in heads}
+    assert used.isdisjoint(head.frame_index for head in store.keyframe_heads(1))
+    for head in heads:
+        placed = poses[ids.index(head.keyframe_id)] @ head.keyframe_from_camera
+        metres, degrees = pose_error(placed, entries[head.frame_index].world_from_camera)
+        assert metres < 1e-6
+        assert degrees < 1e-4
+        assert head.camera == recording.camera
+    free = [entry for entry in recording.entries if entry.index not in used]
+    keyframes = {head.frame_index for head in store.keyframe_heads(1)}
+    support = {0: 0, 2: 0}
+    for entry in [entry for entry in free if entry.index not in keyframes][:4]:
+        frame = recording.read(entry)
+        found = describer().describe(frame.image, None, frame.camera, frame.instances)
+        for count in support:
+            answer = localizer(store, count).localize(found)
+            assert all(candidate.keyframe_id > 0 for candidate in answer.candidates)
+            assert answer.best_keyframe_id is None or answer.best_keyframe_id in ids
+            support[count] += answer.inliers
+            if count:
+                assert answer.verdict is Verdict.LOCALIZED
+                assert pose_error(answer.world_from_camera, entry.world_from_camera)[0] < 0.03
+    assert support[2] > 1.2 * support[0]
+
+
+def test_again_the_same_rows_and_none_of_those_that_are_left_out(room: Path, store: Store) -> None:
+    recording, info = open_recording(room), store.find_map("room")
+    before = load_frames(store.engine, load_frame_heads(store.engine, 1))
+    out = before[0].head.frame_index
+    added = add_frames(store, info, recording, describer(), without=[out])
+    assert out not in {head.frame_index for head in load_frame_heads(store.engine, 1)}
+    again = add_frames(store, info, recording, describer())
+    after = load_frames(store.engine, load_frame_heads(store.engine, 1))
+    assert again.frames == len(after) == len(before)
+    assert added.keyframes == KEYFRAMES
+    for one, other in zip(before, after, strict=True):
+        np.testing.assert_array_equal(one.keypoints.features.descriptors, other.keypoints.features.descriptors)
+        np.testing.assert_array_equal(one.keypoints.points, other.keypoints.points)
+        assert one.grey == other.grey
+
+
+def test_a_map_without_them_answers_as_before(room: Path, store: Store) -> None:
+    recording = open_recording(room)
+    frame = recording.read(recording.entries[1])
+    found = describer().describe(frame.image, None, frame.camera, frame.instances)
+    without = localizer(store, 0).localize(found)
+    heads = load_frame_heads(store.engine, 1)
+    rows = load_frames(store.engine, heads)
+    write_frame_views(store.engine, 1, [])
+    nothing = localizer(store, 2).localize(found)
+    write_frame_views(store.engine, 1, rows)
+    np.testing.assert_array_equal(without.world_from_camera, nothing.world_from_camera)
+    np.testing.assert_equal(dict(without.evidence), dict(nothing.evidence))
+
+
+def test_what_is_no_recording_of_the_map_is_named(room: Path, store: Store, tmp_path: Path) -> None:
+    recording, info = open_recording(room), store.find_map("room")
+    with pytest.raises(UsageError, match="holds no keyframe of a recording 'other'"):
+        add_frames(store, info, replace(recording, name="other"), describer())
+    moved = []
+    for number, entry in enumerate(recording.entries):
+        pose = np.array(entry.world_from_camera)
+        pose[0, 3] += 0.1 * number
+        moved.append(replace(entry, world_from_camera=pose))
+    with pytest.raises(RecordingError, match="otherwise in the map than the recording says"):
+        add_frames(store, info, replace(recording, entries=tuple(moved)), describer())
+    bare = tuple(replace(entry, world_from_camera=None) for entry in recording.entries)
+    with pytest.raises(RecordingError, match="brings no pose of frame"):
+        add_frames(store, info, replace(recording, entries=bare), describer())
+    other = replace(recording, entries=recording.entries[:1])
+    with pytest.raises(RecordingError, match="another recording of that name"):
+        add_frames(store, info, other, describer())
+    assert load_frame_heads(store.engine, 1)
+
+
+def test_a_damaged_row_is_left_out(room: Path, store: Store, caplog: pytest.LogCaptureFixture) -> None:
+    rows = load_frames(store.engine, load_frame_heads(store.engine, 1))
+    head = rows[0].head
+    broken = FrameRow(
+        FrameHead(head.keyframe_id, head.frame_index, np.eye(4), head.camera, 1), rows[0].keypoints, b"no"
+    )
+    write_frame_views(store.engine, 1, [broken])
+    recording = open_recording(room)
+    frame = recording.read(recording.entries[head.frame_index])
+    found = describer().describe(frame.image, None, frame.camera, frame.instances)
+    assert localizer(store, 2).localize(found).verdict is not None
+    assert "frame_views.grey of keyframe" in caplog.text
+    write_frame_views(store.engine, 1, rows)
+
+
+def test_the_command(room: Path, url: str, tmp_path: Path) -> None:
+    copy = tmp_path / "copy.sqlite3"
+    shutil.copy(url.removeprefix("sqlite:///"), copy)
+    run = CliRunner().invoke(app, ["refine", "--frames", str(room), "--database-url", f"sqlite:///{copy}"])
+    assert run.exit_code == 0, run.output
+    assert f"frames beside {KEYFRAMES} keyframes" in run.output
+    for extra in (["--step", "points"], ["--up", "0,0,1"]):
+        run = CliRunner().invoke(app, ["refine", "--frames", str(room), "--database-url", f"sqlite:///{copy}", *extra])
+        assert run.exit_code == 2
+    with open_store(f"sqlite:///{copy}") as store:
+        heads = load_frame_heads(store.engine, 1)
+        gone = heads[0].keyframe_id
+        store.delete_keyframes([gone])
+        left = load_frame_heads(store.engine, 1)
+        assert {head.keyframe_id for head in left} == {head.keyframe_id for head in heads} - {gone}
