@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 from semdb.database import checked
 from semdb.database.keyframe_rows import pose_of
+from semdb.database.lookups import map_id_of
 from semdb.door.found import Evidence, Found, FoundLandmark, Missing, Viewpoint
-from semdb.errors import CodecError, NotFoundError, UsageError
+from semdb.errors import CodecError, UsageError
 from semdb.names import storable
 from semdb.shown import for_terminal
 from semdb.types import FloatArray
 
 if TYPE_CHECKING:
     from semdb.database.landmark_search import Wanted
-    from semdb.database.records import MapHead
     from semdb.database.store import Store
     from semdb.landmarks.words import Understood, Vectors
 
@@ -49,34 +49,30 @@ def find(
     known = rows.known_classes(store.engine)
     asked = {"what": what, "near": near, "on": on, "not_near": not_near}
     meant = {name: understand(word, known, vectors) for name, word in asked.items() if word is not None}
-    info = None if map is None else _map(store, map)
-    after_ns, seen_in = _seen_after(store, seen_after, None if info is None else info.id)
+    map_id = None if map is None else _map_id(store, map)
+    after_ns, seen_in = _seen_after(store, seen_after, map_id)
     wanted = rows.Wanted(
         classes=meant["what"].classes,
         near=_classes(meant, "near"),
         on=_classes(meant, "on"),
         not_near=_classes(meant, "not_near"),
-        map_id=None if info is None else info.id,
+        map_id=map_id,
         seen_after_ns=after_ns,
         seen_in=seen_in,
         origin=None if origin is None else _origin(origin),
         limit=limit,
     )
-    found = rows.search(store.engine, wanted)
-    evidence = rows.sightings_of(store.engine, [row.landmark_id for row in found]) if found else {}
+    found, evidence = rows.search(store.engine, wanted)
     hits = tuple(_hit(row, evidence.get(int(row.landmark_id), []), wanted) for row in found)
     understood: dict[str, Mapping[str, Any]] = {name: item.as_dict() for name, item in meant.items()}
     missing = None if hits else _missing(store, wanted, meant)
     return Found(understood, hits, missing, partial(rows.as_text, store.engine, wanted))
 
 
-def _map(store: Store, name: str) -> MapHead:
-    """A map by name, at the price of small queries. Raises NotFoundError, which names those that there are."""
-    for head in store.map_heads():
-        if head.name == storable(name):
-            return head
-    store.find_map(name)
-    raise NotFoundError(f"there is no map {name!r}")
+def _map_id(store: Store, name: str) -> int:
+    """The id of a map by its name, at the price of a small query. Raises NotFoundError, which names those there are."""
+    found = map_id_of(store.engine, storable(name))
+    return store.find_map(name).id if found is None else found
 
 
 def _classes(meant: Mapping[str, Understood], name: str) -> tuple[str, ...]:
@@ -191,21 +187,17 @@ def _missing(store: Store, wanted: Wanted, meant: Mapping[str, Understood]) -> M
     from semdb.database import landmark_search as rows
 
     said = meant["what"].said
-    usual = tuple(
-        {"relation": kind, "category": name, "count": number}
-        for kind, name, number in rows.usual_places(store.engine, wanted.classes)
-    )
-    there = rows.earlier_ones(store.engine, wanted)
-    for part, names in (("near", wanted.near), ("on", wanted.on)):
-        if names and not rows.anchors(store.engine, names, wanted.map_id):
+    known = rows.unfound(store.engine, wanted)
+    usual = tuple({"relation": kind, "category": name, "count": number} for kind, name, number in known.usual)
+    there, gone = known.there, known.gone
+    for part, seen in known.anchors.items():
+        if not seen:
             text = f"no {meant[part].said} was seen, so no place {part} one was looked at"
             return Missing(NOT_LOOKED_AT, text, _candidates(there), usual)
-    gone = rows.gone_ones(store.engine, wanted)
     if gone and not there:
         return Missing(GONE, f"{said}: was seen, and later keyframes see through its place", _candidates(gone), usual)
     if not there:
-        number = rows.objects_of(store.engine, wanted.classes, wanted.map_id)
-        hint = f" ({number} objects are no landmark: run semdb refine)" if number else ""
+        hint = f" ({known.objects} objects are no landmark: run semdb refine)" if known.objects else ""
         return Missing(NEVER_SEEN, f"{said}: never seen{hint}", (), usual)
     if wanted.seen_after_ns is not None or wanted.seen_in is not None:
         text = f"{said}: seen, but not since then; where it was has not been seen empty"

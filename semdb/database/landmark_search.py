@@ -11,7 +11,21 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-from sqlalchemy import Double, Engine, Integer, Select, and_, bindparam, case, exists, func, literal, or_, select
+from sqlalchemy import (
+    Connection,
+    Double,
+    Engine,
+    Integer,
+    Select,
+    and_,
+    bindparam,
+    case,
+    exists,
+    func,
+    literal,
+    or_,
+    select,
+)
 from sqlalchemy.sql.elements import ColumnElement
 
 from semdb.database import retry
@@ -33,6 +47,7 @@ TENTATIVE = 0.5  # of the score of a confirmed landmark
 WALK_M = 5.0  # from the origin: a landmark so far away has half the score
 NOT_NEAR = 0.5  # a relation of this score is one
 MOST_SIGHTINGS = 20  # of a hit
+MOST_LISTED = 5  # of what is known where nothing is found
 MOST_COUNTED = 200  # landmarks, of which it is counted where they stand
 CONFIRMED, GONE = "confirmed", "gone"
 
@@ -207,16 +222,34 @@ def as_text(engine: Engine, wanted: Wanted) -> str:
     return str(statement(wanted).compile(engine, compile_kwargs={"literal_binds": True}))
 
 
-def search(engine: Engine, wanted: Wanted) -> list[Any]:
-    """The rows of `statement`."""
+def search(engine: Engine, wanted: Wanted) -> tuple[list[Any], dict[int, list[Any]]]:
+    """The rows of `statement`, and the sightings that speak for each landmark (see `sightings_of`)."""
     query = statement(wanted)
-    return retry.read(engine, lambda connection: list(connection.execute(query)))
+
+    def work(connection: Connection) -> tuple[list[Any], dict[int, list[Any]]]:
+        found = list(connection.execute(query))
+        return found, sightings_of(connection, [int(row.landmark_id) for row in found])
+
+    return retry.read(engine, work)
 
 
-def sightings_of(engine: Engine, ids: Sequence[int]) -> dict[int, list[Any]]:
+def sightings_of(connection: Connection, ids: Sequence[int]) -> dict[int, list[Any]]:
     """Up to `MOST_SIGHTINGS` sightings of each of a few landmarks, the clearest first."""
+    found: dict[int, list[Any]] = {key: [] for key in ids}
+    if not ids:
+        return found
+    for row in connection.execute(_sightings_statement(), {"ids": list(ids)}):
+        found[int(row.landmark_id)].append(row)
+    for rows in found.values():
+        rows.sort(key=lambda row: (-row.visibility * row.coverage, row.recording, row.frame_index, row.object_id))
+        del rows[MOST_SIGHTINGS:]
+    return found
+
+
+@lru_cache(maxsize=1)
+def _sightings_statement() -> Select[Any]:
     s, o, k = landmark_sightings.c, objects.c, keyframes.c
-    query = (
+    return (
         select(s.landmark_id, s.object_id, s.coverage, s.visibility, o.keyframe_id, o.score, categories.c.name)
         .add_columns(recordings.c.name.label("recording"), k.frame_index)
         .select_from(
@@ -225,91 +258,120 @@ def sightings_of(engine: Engine, ids: Sequence[int]) -> dict[int, list[Any]]:
             .join(recordings, recordings.c.id == k.recording_id)
             .join(categories, categories.c.id == o.category_id)
         )
-        .where(s.landmark_id.in_([int(key) for key in ids]))
+        .where(s.landmark_id.in_(bindparam("ids", expanding=True)))
     )
-    found: dict[int, list[Any]] = {int(key): [] for key in ids}
-    for row in retry.read(engine, lambda connection: list(connection.execute(query))):
-        found[int(row.landmark_id)].append(row)
-    for rows in found.values():
-        rows.sort(key=lambda row: (-row.visibility * row.coverage, row.recording, row.frame_index, row.object_id))
-        del rows[MOST_SIGHTINGS:]
-    return found
 
 
-def gone_ones(engine: Engine, wanted: Wanted, limit: int = 5) -> list[Any]:
-    """Landmarks of the wanted classes that were there and are gone, the last seen first."""
-    return _listed(engine, Wanted(wanted.classes, map_id=wanted.map_id, limit=limit), gone=True)
+@dataclass(frozen=True, slots=True)
+class Unfound:
+    """What is known of the classes of a search that found nothing.
+
+    `there`, `gone`: landmarks of them that are not gone, whatever else was asked, and that are; a few, the last seen
+    first. `anchors`: whether there are landmarks of the classes that it was to stand near, and on. `objects`: how many
+    objects keyframes show of the classes, counted where no landmark is there. `usual`: see `_usual_places`.
+    """
+
+    there: list[Any]
+    gone: list[Any]
+    anchors: dict[str, bool]
+    objects: int
+    usual: list[tuple[str, str, int]]
 
 
-def earlier_ones(engine: Engine, wanted: Wanted, limit: int = 5) -> list[Any]:
-    """Landmarks of the wanted classes whatever is asked of time, and of what they stand near or on."""
-    return _listed(engine, Wanted(wanted.classes, map_id=wanted.map_id, limit=limit), gone=False)
+def unfound(engine: Engine, wanted: Wanted) -> Unfound:
+    """What is known where `search` found nothing, as of one moment."""
+    plain = Wanted(wanted.classes, map_id=wanted.map_id, limit=MOST_LISTED)
+
+    def work(connection: Connection) -> Unfound:
+        there, gone = (_listed(connection, plain, gone=gone) for gone in (False, True))
+        parts = (("near", wanted.near), ("on", wanted.on))
+        known = {name: _any_of(connection, classes, wanted.map_id) for name, classes in parts if classes}
+        number = 0 if there or gone else _objects_of(connection, wanted.classes, wanted.map_id)
+        return Unfound(there, gone, known, number, _usual_places(connection, wanted.classes))
+
+    return retry.read(engine, work)
 
 
-def _listed(engine: Engine, wanted: Wanted, *, gone: bool) -> list[Any]:
-    statement = _list_statement(_shape(wanted), gone).params(**_values(wanted))
-    return retry.read(engine, lambda connection: list(connection.execute(statement)))
+def _listed(connection: Connection, wanted: Wanted, *, gone: bool) -> list[Any]:
+    return list(connection.execute(_list_statement(_shape(wanted), gone), _values(wanted)))
 
 
 @lru_cache(maxsize=16)
 def _list_statement(wanted: _Shape, gone: bool) -> Select[Any]:
+    """A few landmarks, the last seen first: chosen before anything is looked up of them."""
     m = landmarks.c
     last, last_of = keyframes.alias("last"), recordings.alias("last_of")
+    newest = (
+        select(m.id, m.last_seen_ns)
+        .where(*_conditions(wanted, gone=gone))
+        .order_by(m.last_seen_ns.desc(), m.id)
+        .limit(bindparam("most", type_=Integer))
+        .subquery("newest")
+    )
     return (
         select(m.id, categories.c.name.label("category"), maps.c.name.label("map"), m.x, m.y, m.z, m.last_seen_ns)
         .add_columns(last_of.c.name.label("last_recording"), last.c.frame_index.label("last_frame_index"))
         .select_from(
-            landmarks.join(categories, categories.c.id == m.category_id)
+            newest.join(landmarks, m.id == newest.c.id)
+            .join(categories, categories.c.id == m.category_id)
             .join(maps, maps.c.id == m.map_id)
             .outerjoin(last, last.c.id == m.last_keyframe_id)
             .outerjoin(last_of, last_of.c.id == last.c.recording_id)
         )
-        .where(*_conditions(wanted, gone=gone))
-        .order_by(m.last_seen_ns.desc(), m.id)
-        .limit(bindparam("most", type_=Integer))
+        .order_by(newest.c.last_seen_ns.desc(), newest.c.id)
     )
 
 
-def anchors(engine: Engine, names: Sequence[str], map_id: int | None) -> int:
-    """How many landmarks of these classes there are, gone or not."""
-    query = select(func.count()).select_from(landmarks).where(landmarks.c.category_id.in_(_ids_of(names)))
-    if map_id is not None:
-        query = query.where(landmarks.c.map_id == map_id)
-    return int(retry.read(engine, lambda connection: connection.execute(query).scalar()) or 0)
+def _any_of(connection: Connection, names: Sequence[str], map_id: int | None) -> bool:
+    """Whether there are landmarks of these classes, gone or not."""
+    statement, values = _any_statement(map_id is not None), {"classes": list(names), "map_id": map_id}
+    return connection.execute(statement, values if map_id is not None else {"classes": list(names)}).first() is not None
 
 
-def objects_of(engine: Engine, names: Sequence[str], map_id: int | None) -> int:
+@lru_cache(maxsize=2)
+def _any_statement(in_map: bool) -> Select[Any]:
+    found = select(literal(1)).select_from(landmarks).where(landmarks.c.category_id.in_(_ids_of("classes"))).limit(1)
+    return found.where(landmarks.c.map_id == bindparam("map_id")) if in_map else found
+
+
+def _objects_of(connection: Connection, names: Sequence[str], map_id: int | None) -> int:
     """How many objects of these classes keyframes show."""
     query = select(func.count()).select_from(objects.join(keyframes).join(recordings))
     query = query.where(objects.c.category_id.in_(_ids_of(names)))
     if map_id is not None:
         query = query.where(recordings.c.map_id == map_id)
-    return int(retry.read(engine, lambda connection: connection.execute(query).scalar()) or 0)
+    return int(connection.execute(query).scalar() or 0)
 
 
-def usual_places(engine: Engine, names: Sequence[str], limit: int = 5) -> list[tuple[str, str, int]]:
+def _usual_places(connection: Connection, names: Sequence[str]) -> list[tuple[str, str, int]]:
     """On, in or beside what the newest `MOST_COUNTED` landmarks of these classes stand in this database: kind, class,
     how many; most first.
     """
+    rows = connection.execute(_usual_statement(), {"classes": list(names)})
+    return [(str(kind), str(name), int(count)) for kind, name, count in rows]
+
+
+@lru_cache(maxsize=1)
+def _usual_statement() -> Select[Any]:
+    """Counted by the ids of classes, which get their names afterwards."""
     r, m = landmark_relations.c, landmarks.c
-    number = func.count().label("number")
-    newest = select(m.id).where(m.category_id.in_(_ids_of(names))).order_by(m.id.desc()).limit(MOST_COUNTED)
+    newest = select(m.id).where(m.category_id.in_(_ids_of("classes"))).order_by(m.id.desc()).limit(MOST_COUNTED)
     counted = newest.subquery("newest")  # servers want no limit inside of IN
-    query = (
-        select(r.kind, categories.c.name, number)
-        .select_from(
-            counted.join(landmark_relations, r.landmark_id == counted.c.id).join(
-                categories, categories.c.id == r.other_category_id
-            )
-        )
+    numbers = (
+        select(r.kind, r.other_category_id, func.count().label("number"))
+        .select_from(counted.join(landmark_relations, r.landmark_id == counted.c.id))
         .where(r.score >= NOT_NEAR)
         .where(or_(r.kind == "on", r.kind == "in", r.kind == "next_to"))
-        .group_by(r.kind, categories.c.name)
-        .order_by(number.desc(), r.kind.desc(), categories.c.name)
-        .limit(limit)
+        .group_by(r.kind, r.other_category_id)
+        .subquery("numbers")
     )
-    rows = retry.read(engine, lambda connection: list(connection.execute(query)))
-    return [(str(kind), str(name), int(count)) for kind, name, count in rows]
+    n = numbers.c
+    return (
+        select(n.kind, categories.c.name, n.number)
+        .select_from(numbers.join(categories, categories.c.id == n.other_category_id))
+        .order_by(n.number.desc(), n.kind.desc(), categories.c.name)
+        .limit(MOST_LISTED)
+    )
 
 
 def known_classes(engine: Engine) -> list[str]:

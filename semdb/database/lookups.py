@@ -65,6 +65,13 @@ def map_heads(engine: Engine) -> list[MapHead]:
     return retry.read(engine, work)
 
 
+def map_id_of(engine: Engine, name: str) -> int | None:
+    """The id of the map of a name as it is stored; None where there is none."""
+    query = select(maps.c.id).where(maps.c.name == name)
+    found = retry.read(engine, lambda connection: connection.execute(query).scalar())
+    return None if found is None else int(found)
+
+
 def planned_frames(engine: Engine, map_name: str, recording: str) -> tuple[int, ...]:
     """Frame indexes of the stored plan of a recording, ascending; empty where there is none."""
     query = (
