@@ -45,10 +45,13 @@ def turned_box(centre: FloatArray, size: FloatArray, yaw: float, up: FloatArray)
     return Box(np.asarray(centre, np.float64), np.asarray(size, np.float64), upright_axes(up) @ turn)
 
 
-def upright_box(points: FloatArray, up: FloatArray, trim: float = 0.0, least: float = 0.005) -> Box:
+def upright_box(
+    points: FloatArray, up: FloatArray, trim: float = 0.0, least: float = 0.005, noise: FloatArray | None = None
+) -> Box:
     """The box of the least footprint about `points` ``[n, 3]``, without the share `trim` at each end of each axis.
 
-    Of the directions of the footprint, every degree is tried; sizes are at least `least` metres.
+    Of the directions of the footprint, every degree is tried; sizes are at least `least` metres. `noise` ``[3, 3]`` is
+    the covariance of the points' own errors: by as much as their variance along an axis is of these, a side is shorter.
     """
     frame = upright_axes(up)
     local = points @ frame
@@ -58,6 +61,12 @@ def upright_box(points: FloatArray, up: FloatArray, trim: float = 0.0, least: fl
     low, high = trim, 1 - trim
     width = np.quantile(u, high, axis=0) - np.quantile(u, low, axis=0)
     depth = np.quantile(v, high, axis=0) - np.quantile(v, low, axis=0)
+    if noise is not None:
+        turned = frame.T @ noise @ frame
+        own_u = turned[0, 0] * np.cos(angles) ** 2 + turned[1, 1] * np.sin(angles) ** 2
+        mixed = 2 * turned[0, 1] * np.cos(angles) * np.sin(angles)
+        width = width * _without_noise(u.var(axis=0), own_u + mixed)
+        depth = depth * _without_noise(v.var(axis=0), turned[0, 0] + turned[1, 1] - own_u - mixed)
     area = np.maximum(width, least) * np.maximum(depth, least)
     # two faces of a box are a triangle seen from above, and as small a box about them lies across it: points that lie
     # at the sides of their box tell the two apart (Zhang and others, IV 2017)
@@ -70,7 +79,15 @@ def upright_box(points: FloatArray, up: FloatArray, trim: float = 0.0, least: fl
     axes = frame @ turn
     own = points @ axes
     first, last = np.quantile(own, low, axis=0), np.quantile(own, high, axis=0)
-    return Box(axes @ ((first + last) / 2), np.maximum(last - first, least), axes)
+    size = last - first
+    if noise is not None:
+        size = size * _without_noise(own.var(axis=0), np.diag(axes.T @ noise @ axes))
+    return Box(axes @ ((first + last) / 2), np.maximum(size, least), axes)
+
+
+def _without_noise(variance: FloatArray, noise: FloatArray) -> FloatArray:
+    """How much shorter a side is than points of that `variance` are spread, of which `noise` is errors."""
+    return np.asarray(np.sqrt(np.clip(1 - noise / np.maximum(variance, 1e-12), 0.0, 1.0)), np.float64)
 
 
 def intersection_over_union(one: Box, other: Box) -> float:

@@ -13,15 +13,15 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from semdb.landmarks.appearance import mean_colours
-from semdb.landmarks.boxes import shared_volume, upright_box
+from semdb.landmarks.boxes import shared_volume
 from semdb.landmarks.clustering import UNIT, clusters
 from semdb.landmarks.evidence import fuse, name_probabilities
 from semdb.landmarks.gravity import Gravity, estimate_gravity
 from semdb.landmarks.lift import LiftedKeyframe
 from semdb.landmarks.links import find_links, sighting_table, weights
 from semdb.landmarks.options import LandmarkOptions
-from semdb.landmarks.register import corrected_poses
-from semdb.landmarks.shape import thing_points
+from semdb.landmarks.register import registered
+from semdb.landmarks.shape import thing_box, thing_points
 from semdb.landmarks.values import BestView, Landmark, Landmarks, LandmarkState, Member
 from semdb.landmarks.visibility import IN_VIEW, THROUGH, VISIBLE, Sightings, Views, collect, look
 from semdb.landmarks.visits import Presence, visits_of
@@ -31,6 +31,7 @@ Progress = Callable[[int, int], None]
 EXPECTED = 0.5  # share of a thing's points in sight: the detector should have seen it
 SEEN_THROUGH = 0.6  # share of a thing's points that are looked through
 MOST_VIEWS = 3
+UNKNOWN_APART_M = 0.01  # of a keyframe that no other one sees a surface of
 FULL_SIZE = 0.02  # of the image: a thing this large is large enough to be looked at
 
 
@@ -61,9 +62,13 @@ def find_landmarks(
     """
     options = options or LandmarkOptions()
     lifted = [frame.lifted for frame in keyframes]
-    poses = corrected_poses(lifted, options.register)
+    agreed = registered(lifted, options.register)
+    poses, apart = agreed.poses, np.nan_to_num(agreed.apart, nan=UNKNOWN_APART_M)
     moved = [float(np.linalg.norm(p[:3, 3] - f.world_from_camera[:3, 3])) for p, f in zip(poses, lifted, strict=True)]
-    lifted = [replace(frame, world_from_camera=pose) for frame, pose in zip(lifted, poses, strict=True)]
+    lifted = [
+        replace(frame, world_from_camera=pose, apart=float(off))
+        for frame, pose, off in zip(lifted, poses, apart, strict=True)
+    ]
     gravity = estimate_gravity(lifted, up)
     sightings = collect(lifted)
     views = look(lifted, sightings, options.see, progress)
@@ -193,8 +198,8 @@ class _Assembly:
         """The landmark of the sightings of a cluster."""
         rows, options = self._rows[root], self._options
         members = self._members(rows)
-        points = thing_points(self._lifted, members, options.see, options.shape)
-        box = upright_box(points, self._gravity.up, options.shape.trim)
+        points = thing_points(self._lifted, members, options.shape)
+        box = thing_box(self._lifted, members, points, self._gravity.up, options.shape)
         objects = [(k, int(o)) for k, s in sorted(members.items()) for one in sorted(s) for o in self._ordinals(k, one)]
         objects.sort()
         category = np.array([self._keyframes[k].category[o] for k, o in objects], np.int64)
@@ -245,7 +250,7 @@ class _Assembly:
             np.unique(np.concatenate(candidates)),
             thing.box,
             self._gravity.up,
-            (options.see, options.shape, options.visit),
+            (options.shape, options.visit),
         )
         after = [v for v in visits if self._is_later(self._first_of(v.recording), thing.last)]
         gone = any(visit.presence is Presence.ABSENT for visit in after)

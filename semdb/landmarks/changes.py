@@ -18,10 +18,12 @@ from semdb.landmarks.visits import Presence
 from semdb.types import Float32Array, FloatArray
 
 LEAST_MOVED_M = 0.04  # a thing that both visits show has moved by at least this,
-LEAST_THROUGH = 0.12  # and so much of its points is seen through from the other visit
+LEAST_THROUGH = 0.1  # and so much of its points is seen through from the other visit
 LEAST_KEYFRAMES = 2  # that show a thing which appeared or disappeared
 LEAST_MISSED = 2  # keyframes that look at the place of a flat thing and find none
 GLIMPSED = 0.2  # of the points that are seen through where most are hidden
+CONTRADICTED = 0.3  # of the points that are seen: something is there
+HIDDEN = 0.7  # how sure it is of a thing that it was not there, of whose place next to nothing was seen
 LEAST_SCORE = 0.35  # of a pair
 CARRIED_M = 4.0  # a thing that stands so far away is half as likely the same one
 SIZE_RATIO = 2.5  # of the sides of two boxes: where they differ so, they are half as alike
@@ -77,28 +79,33 @@ class Changed:
 def find_changes(things: Sequence[VisitedThing]) -> list[Changed]:
     """All changes, by kind and the keys of the things."""
     found = [change for thing in things if (change := _in_place(thing)) is not None]
-    old = [t for t in things if _only(t.before, t.after)]
-    new = [t for t in things if _only(t.after, t.before)]
+    old = [(t, sure) for t in things if (sure := _only(t.before, t.after)) > 0]
+    new = [(t, sure) for t in things if (sure := _only(t.after, t.before)) > 0]
     taken: set[int] = set()
     if old and new:
-        score = np.array([[alike(one, other) for other in new] for one in old])
+        score = np.array([[alike(one, other) * _both(a, b) for other, b in new] for one, a in old])
         score = np.where(score >= LEAST_SCORE, score, 0.0)
         for row, column in zip(*linear_sum_assignment(-score), strict=True):
             if score[row, column] > 0:
-                one, other = old[row], new[column]
+                one, other = old[row][0], new[column][0]
                 taken |= {one.key, other.key}
                 found.append(
                     Changed(
                         Change.MOVED, one, other, round(float(score[row, column]), 6), _apart(one.before, other.after)
                     )
                 )
-    for thing in old:
+    for thing, _ in old:
         if thing.key not in taken and _gone(thing.before, thing.after):
             found.append(Changed(Change.DISAPPEARED, thing, None, _share(thing.after), None))
-    for thing in new:
+    for thing, _ in new:
         if thing.key not in taken and _gone(thing.after, thing.before):
             found.append(Changed(Change.APPEARED, None, thing, _share(thing.before), None))
     return sorted(found, key=_rank)
+
+
+def _both(one: float, other: float) -> float:
+    """How sure it is of two things that each is in one visit alone: one of them has to be."""
+    return one * other if max(one, other) >= 1.0 else 0.0
 
 
 def _rank(change: Changed) -> tuple[str, int, int]:
@@ -118,16 +125,22 @@ def _in_place(thing: VisitedThing) -> Changed | None:
     return Changed(Change.MOVED, thing, thing, round(min(1.0, 2 * through / points), 6), distance)
 
 
-def _only(shows: SeenIn | None, other: SeenIn | None) -> bool:
-    """Whether one visit shows a thing and the other one looked at its place, and found none."""
+def _only(shows: SeenIn | None, other: SeenIn | None) -> float:
+    """How sure it is that of two visits one alone shows a thing, 0..1."""
     if shows is None or other is None or shows.presence is not Presence.PRESENT:
-        return False
+        return 0.0
     if other.presence is Presence.ABSENT:
-        return True
+        return 1.0
+    if other.presence is not Presence.UNOBSERVED:
+        return 0.0
     # where half of it is hidden, or it lies flat and is never seen through: enough if it is found elsewhere, and for
     # nothing else
-    glimpsed = other.seen_through >= max(GLIMPSED * other.points, 2 * other.seen, 1)
-    return other.presence is Presence.UNOBSERVED and (glimpsed or other.missed >= LEAST_MISSED)
+    glimpsed = other.seen_through >= max(GLIMPSED * other.points, 1)
+    if (glimpsed and other.seen_through >= 2 * other.seen) or other.missed >= LEAST_MISSED:
+        return 1.0
+    if other.seen <= CONTRADICTED * other.points:
+        return HIDDEN
+    return other.seen_through / (other.seen_through + other.seen) if glimpsed else 0.0
 
 
 def _gone(shows: SeenIn | None, other: SeenIn | None) -> bool:

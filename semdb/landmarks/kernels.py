@@ -7,6 +7,7 @@ from __future__ import annotations
 import numpy as np
 
 from semdb.compiled import kernel
+from semdb.geometry.sensor import AT_LEAST_M, GROWTH_PER_M, NEAREST_M
 
 
 @kernel
@@ -41,6 +42,35 @@ def inner_pixels(depth, owner, label, border, jump, share, box, out):  # type: i
             if good:
                 out[n] = v * width + u
                 n += 1
+    return n
+
+
+@kernel
+def joined_pixels(depth, owner, label, inner, number, jump, share, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Pixels of `label` that the first `number` of `inner` reach from neighbour to neighbour without a depth edge.
+
+    Writes flat pixels to `out`, `inner` first, and returns how many.
+    """
+    height, width = depth.shape
+    known = np.zeros(height * width, np.uint8)
+    for k in range(number):
+        known[inner[k]] = 1
+        out[k] = inner[k]
+    n, next_one = number, 0
+    while next_one < n:
+        pixel = out[next_one]
+        next_one += 1
+        v, u = pixel // width, pixel % width
+        z = depth[v, u]
+        for y in range(max(v - 1, 0), min(v + 2, height)):
+            for x in range(max(u - 1, 0), min(u + 2, width)):
+                other = y * width + x
+                if known[other] or owner[y, x] != label or not depth[y, x] > 0:
+                    continue
+                if abs(depth[y, x] - z) <= jump + share * z:
+                    known[other] = 1
+                    out[n] = other
+                    n += 1
     return n
 
 
@@ -154,10 +184,22 @@ def look_up(  # type: ignore[no-untyped-def]  # pragma: no cover
 
 
 @kernel
+def _beside(row, column, z, near, grid_depth, grid_owner, mine):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Whether a cell next to this one, of a label of `mine`, has that depth: what is thin falls between cells."""
+    rows, columns = grid_depth.shape
+    for b in range(max(row - 1, 0), min(row + 2, rows)):
+        for a in range(max(column - 1, 0), min(column + 2, columns)):
+            if mine[grid_owner[b, a]] and grid_depth[b, a] > 0 and abs(grid_depth[b, a] - z) <= near:
+                return True
+    return False
+
+
+@kernel
 def vote(points, camera_from_world, lens, distortion, grid_depth, grid_owner, scale, limits, mine, visible, inside):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Counts for each point float64 ``[n, 3]`` (world) whether a keyframe sees it, and sees it in a label of `mine`.
 
-    `mine` bool ``[labels + 1]``; the others as in `look_up`. Adds to `visible` and `inside`, int32 ``[n]``.
+    `mine` bool ``[labels + 1]``; `limits`: how near a surface is seen, in metres and as a multiple of
+    `depth_noise`; the others as in `look_up`. Adds to `visible` and `inside`, int32 ``[n]``.
     """
     fx, fy, cx, cy, width, height = lens
     k1, k2, p1, p2, k3 = distortion
@@ -182,7 +224,8 @@ def vote(points, camera_from_world, lens, distortion, grid_depth, grid_owner, sc
         column = min(int((u + 0.5) / scale), columns - 1)
         row = min(int((v + 0.5) / scale), rows - 1)
         measured = grid_depth[row, column]
-        if measured > 0 and abs(measured - z) <= limits[0] + limits[1] * z:
+        near = limits[0] + limits[1] * (AT_LEAST_M + GROWTH_PER_M * (z - NEAREST_M) ** 2)
+        if measured > 0 and abs(measured - z) <= near:
             visible[k] += 1
-            if mine[grid_owner[row, column]]:
+            if mine[grid_owner[row, column]] or _beside(row, column, z, near, grid_depth, grid_owner, mine):
                 inside[k] += 1

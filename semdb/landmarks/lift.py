@@ -11,12 +11,15 @@ import numpy as np
 import numpy.typing as npt
 
 from semdb.geometry import pixels_to_normalized
+from semdb.geometry.sensor import depth_noise
 from semdb.landmarks.options import LiftOptions, SeeOptions
 from semdb.perception.lifting import lift as lift_points
 from semdb.types import BoolArray, Camera, Float32Array, FloatArray, Int64Array
 
 Labels = npt.NDArray[np.int16]
 _MOST_LABELS = 32_000
+EXACT = 0.25  # noise of less than this: depth is as good as exact
+EXPLAINED = 4.0  # deviations of its noise by which a depth may lie off the plane around it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,6 +50,11 @@ class LiftedKeyframe:
     grid_depth: Float32Array  # [h, w] metres, 0 where unknown
     grid_owner: Labels  # [h, w]
     step: int  # pixels from one cell of the grid to the next; the first is at pixel ``step // 2``
+    noise: float  # of its depth, as a multiple of `depth_noise`
+    single: (
+        FloatArray  # [sightings] share of the outline whose depth is that of one pixel, and of no plane through some
+    )
+    apart: float = 0.0  # metres, a deviation: how far its surfaces lie off those of its neighbours
 
 
 def lift_keyframe(
@@ -61,7 +69,7 @@ def lift_keyframe(
 
     Without depth nothing has a place.
     """
-    from semdb.landmarks.kernels import inner_pixels, rim_pixels
+    from semdb.landmarks.kernels import inner_pixels, joined_pixels, rim_pixels
 
     lift, see = lift or LiftOptions(), see or SeeOptions()
     shape = (camera.height, camera.width)
@@ -75,7 +83,9 @@ def lift_keyframe(
         owner[masks[k]] = k + 1
     buffers = (np.empty(owner.size, np.int64), np.empty(owner.size, np.int64), np.empty(owner.size, np.float32))
     state = np.zeros(owner.size, np.uint8)
+    noise = measured_noise(camera, known)
     points, outline, cut = [], [], np.zeros(len(masks), np.bool_)
+    single = np.ones(len(masks))
     for k, mask in enumerate(masks):
         box = bounds(mask)
         cut[k] = box[0] <= 1 or box[1] <= 1 or box[2] >= shape[1] - 1 or box[3] >= shape[0] - 1
@@ -92,11 +102,18 @@ def lift_keyframe(
         inner = buffers[0][:number]
         inner = inner[at_one_depth(known.ravel()[inner], lift)]
         number, values = len(inner), known.ravel()[inner]
-        points.append(_points(camera, inner, values, lift.samples))
+        points.append(_points(camera, inner, values, lift.samples)[0])
+        if noise < EXACT:  # edges of its depth are those of things: surfaces are followed to the last pixel
+            number = joined_pixels(known, owner, k + 1, inner, number, *limits, buffers[1])
+            inner = np.sort(buffers[1][:number])
+            values = known.ravel()[inner]
         rest = rim_pixels(known, owner, k + 1, border + 2, inner, number, box, state, buffers[1], buffers[2])
-        edge = _points(camera, buffers[1][:rest], buffers[2][:rest], lift.outline // 2, known, owner == k + 1)
-        body = _points(camera, inner, values, lift.outline // 2, known, owner == k + 1)
+        edge, fitted = _points(
+            camera, buffers[1][:rest], buffers[2][:rest], lift.outline // 2, known, owner == k + 1, noise
+        )
+        body, fitted_too = _points(camera, inner, values, lift.outline // 2, known, owner == k + 1, noise)
         outline.append(np.concatenate([body, edge]))
+        single[k] = 1 - np.mean(np.concatenate([fitted, fitted_too]))
     step = max(1, shape[1] // see.grid)
     half = step // 2
     return LiftedKeyframe(
@@ -111,7 +128,27 @@ def lift_keyframe(
         grid_depth=np.ascontiguousarray(known[half::step, half::step]),
         grid_owner=np.ascontiguousarray(owner[half::step, half::step]),
         step=step,
+        noise=noise,
+        single=single,
     )
+
+
+def measured_noise(camera: Camera, depth: Float32Array, apart: int = 24) -> float:
+    """How far `depth` ``[H, W]`` (metres, 0 unknown) scatters about the planes through it, in units of `depth_noise`.
+
+    The median over a grid of pixels `apart` pixels from each other, 0 (depth without noise) to 2.
+    """
+    v, u = (
+        values.ravel() for values in np.mgrid[apart // 2 : camera.height : apart, apart // 2 : camera.width : apart]
+    )
+    z = depth[v, u].astype(np.float64)
+    fitted = lift_points(camera, depth, np.column_stack([u, v]).astype(np.float32))[:, 2]
+    good = (z > 0) & np.isfinite(fitted)
+    if np.count_nonzero(good) < 30:
+        return 1.0
+    off = np.abs(fitted[good] - z[good]) / depth_noise(z[good])
+    # half of the values of a normal distribution lie within 0.6745 of its deviation
+    return float(np.clip(np.median(off) / 0.6745, 0.0, 2.0))
 
 
 def at_one_depth(depth: Float32Array, lift: LiftOptions) -> BoolArray:
@@ -137,25 +174,30 @@ def _points(
     most: int,
     depth: Float32Array | None = None,
     mask: BoolArray | None = None,
-) -> Float32Array:
-    """Camera-frame points ``[k, 3]`` of flat `pixels` ``[n]``: at most `most`, evenly taken.
+    noise: float = 1.0,
+) -> tuple[Float32Array, BoolArray]:
+    """Camera-frame points ``[k, 3]`` of flat `pixels` ``[n]``, at most `most`, evenly taken, and which lie on planes.
 
-    Their depth is that of an inner pixel nearby, `inner` ``[n]``; or, with `depth` and `mask` ``[H, W]``, that of a
-    plane fitted to the mask's pixels around, or their own, where that is as near as the thing is wide.
+    Their depth is that of an inner pixel nearby, `inner` ``[n]``; or, with `depth` and `mask` ``[H, W]``, their own,
+    where that is as near as the thing is wide, or that of a plane fitted to the mask's pixels around, where `noise`
+    (see `measured_noise`) explains the difference: what is measured well enough has edges.
     """
     wanted = min(len(pixels), most)
     taken = (np.arange(wanted) * len(pixels) + len(pixels) // 2) // max(wanted, 1)
     v, u = np.divmod(pixels[taken], camera.width)
     z = inner[taken].astype(np.float64)
+    fitted = np.zeros(wanted, np.bool_)
     if depth is not None and mask is not None and wanted:
         own = depth[v, u].astype(np.float64)
         reach = 0.05 + max(np.ptp(u) / camera.fx, np.ptp(v) / camera.fy) * np.median(z)
         z = np.where((own > 0) & (np.abs(own - z) < reach), own, z)
-        fitted = lift_points(camera, np.where(mask, depth, np.nan), np.column_stack([u, v]).astype(np.float32))[:, 2]
-        z = np.where(np.isfinite(fitted) & (np.abs(fitted - z) < 0.05 + 0.02 * z), fitted, z)
+        plane = lift_points(camera, np.where(mask, depth, np.nan), np.column_stack([u, v]).astype(np.float32))[:, 2]
+        fitted = np.isfinite(plane) & (np.abs(plane - z) < EXPLAINED * noise * depth_noise(z))
+        z = np.where(fitted, plane, z)
     rays = pixels_to_normalized(camera, np.column_stack([u, v]))
     found = np.column_stack([rays * z[:, None], z])
-    return found[np.isfinite(found).all(axis=1)].astype(np.float32)
+    good = np.isfinite(found).all(axis=1)
+    return found[good].astype(np.float32), fitted[good]
 
 
 def bounds(mask: BoolArray) -> Int64Array:

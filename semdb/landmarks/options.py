@@ -88,12 +88,23 @@ class LinkOptions:
 
 @dataclass(frozen=True, slots=True)
 class ShapeOptions:
-    """`kept_share`: a point stays in a landmark when it lies in its masks in this share of the views that see it.
-    `trim`: share of the points off at each end of the box. `voxel`: one point of each cube of this side.
+    """`kept_share`: a point stays in a landmark when it lies in its masks in this share of the views that see it, and
+    where depth is as good as exact, in `fewest_views`. A point is seen where a surface lies within `near_m` +
+    `near_deviations` of its depth (see `VisitOptions`). `trim`: share of the points off at each end of the box,
+    `noisy_trim` where depth has noise. `noise_share`: of the noise of depth that points have on which it is that of one
+    pixel, `fitted_share` of that where it is that of a plane; sides are shorter by it. `voxel`: one point of each cube
+    of this side.
     """
 
     kept_share: float = 0.5
+    fewest_views: int = 2
+    near_m: float = 0.01
+    near_deviations: float = 3.0
+    least_noise: float = 0.25
     trim: float = 0.003
+    noisy_trim: float = 0.01
+    noise_share: float = 1.0
+    fitted_share: float = 0.4
     voxel: float = 0.01
     most_points: int = 3000
 
@@ -102,17 +113,20 @@ class ShapeOptions:
 class VisitOptions:
     """What a visit says of a thing that it shows no sighting of.
 
-    `points` of the thing are looked up, evenly taken. One is seen within `near_m` + `near_share` of its depth, and seen
-    through where all that was measured about it is farther by `through_m` + `through_share_of_depth`. A thing is absent
+    `points` of the thing are looked up, evenly taken. One is seen within `near_m` + `near_deviations` of its depth, and
+    seen through where all that was measured about it is farther by `through_m` + `through_deviations`. A deviation is
+    that of depth there and that by which the visit's keyframe disagrees with its neighbours, `least_noise` of what
+    structured light has at least. A thing is absent
     where at least `through_share` of its points are seen through, and `through_to_seen` times as many as are seen. A
     keyframe that sees `missed_share` of them in no mask missed it.
     """
 
     points: int = 400
-    near_m: float = 0.02
-    near_share: float = 0.005
-    through_m: float = 0.03
-    through_share_of_depth: float = 0.01
+    near_m: float = 0.008
+    near_deviations: float = 2.0
+    through_m: float = 0.012
+    through_deviations: float = 3.5
+    least_noise: float = 0.25
     through_share: float = 0.4
     through_to_seen: float = 1.0
     missed_share: float = 0.5

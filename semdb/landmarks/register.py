@@ -23,6 +23,8 @@ from semdb.landmarks.lift import LiftedKeyframe
 from semdb.landmarks.options import RegisterOptions
 from semdb.types import FloatArray
 
+LEAST_COMPARED = 50  # points of a keyframe that fall on surfaces of another
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
@@ -35,16 +37,36 @@ class Surface:
     lens: FloatArray  # fx, fy, cx, cy of the grid
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Registered:
+    """Poses ``[n, 4, 4]``, and how far the surfaces of each keyframe lie off those of its neighbours ``[n]``, metres.
+
+    `apart` is the median distance of point to plane as a standard deviation; NaN without neighbours.
+    """
+
+    poses: FloatArray
+    apart: FloatArray
+
+
 def corrected_poses(
     lifted: Sequence[LiftedKeyframe],
     options: RegisterOptions | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> FloatArray:
     """Poses ``[n, 4, 4]`` of the keyframes after registration; without common surfaces a keyframe stays where it is."""
+    return registered(lifted, options, progress).poses
+
+
+def registered(
+    lifted: Sequence[LiftedKeyframe],
+    options: RegisterOptions | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Registered:
+    """Poses of the keyframes after registration, and how well they agree."""
     options = options or RegisterOptions()
     poses = np.array([frame.world_from_camera for frame in lifted], np.float64).reshape(-1, 4, 4)
     if len(lifted) < 2 or options.rounds < 1:
-        return poses
+        return Registered(poses, np.full(len(poses), np.nan))
     surfaces = [surface_of(frame, options) for frame in lifted]
     pairs = _neighbours(surfaces, poses, options)
     start = poses.copy()
@@ -53,7 +75,33 @@ def corrected_poses(
         _solve(surfaces, poses, start, pairs, reach, options)
         if progress is not None:
             progress(done + 1, options.rounds)
-    return poses
+    return Registered(poses, _apart(surfaces, poses, pairs, options.reach_m * options.narrower**options.rounds))
+
+
+def _apart(
+    surfaces: Sequence[Surface], poses: FloatArray, pairs: Sequence[tuple[int, int]], reach: float
+) -> FloatArray:
+    """Of each keyframe the median over its neighbours of `plane_distances`' medians, as a deviation; NaN without."""
+    found: list[list[float]] = [[] for _ in surfaces]
+    for i, j in pairs:
+        one, other = surfaces[i], surfaces[j]
+        away = np.empty(len(one.points))
+        number: int = plane_distances(
+            one.points,
+            poses[i],
+            other.grid_points,
+            other.grid_normals,
+            poses[j],
+            invert_pose(poses[j]),
+            other.lens,
+            reach,
+            away,
+        )
+        if number >= LEAST_COMPARED:
+            middle = float(np.median(away[:number]))
+            found[i].append(middle)
+            found[j].append(middle)
+    return np.array([np.median(values) / 0.6745 if values else np.nan for values in found], np.float64)
 
 
 def surface_of(frame: LiftedKeyframe, options: RegisterOptions) -> Surface:
@@ -274,3 +322,36 @@ def pair_equations(points, normals, pose, grid, grid_normals, other, other_inver
             side[r] -= weight * j[r] * away
             for c in range(12):
                 block[r, c] += weight * j[r] * j[c]
+
+
+@kernel
+def plane_distances(points, pose, grid, grid_normals, other, other_inverse, lens, reach, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Writes to `out` how far each of `points` ``[n, 3]`` lies off the surface of another keyframe; returns how many.
+
+    Those that fall on no surface of it, or farther than `reach` from it, are left out.
+    """
+    rows, columns = grid.shape[:2]
+    n = 0
+    for k in range(len(points)):
+        lx, ly, lz = points[k]
+        wx = pose[0, 0] * lx + pose[0, 1] * ly + pose[0, 2] * lz + pose[0, 3]
+        wy = pose[1, 0] * lx + pose[1, 1] * ly + pose[1, 2] * lz + pose[1, 3]
+        wz = pose[2, 0] * lx + pose[2, 1] * ly + pose[2, 2] * lz + pose[2, 3]
+        z = other_inverse[2, 0] * wx + other_inverse[2, 1] * wy + other_inverse[2, 2] * wz + other_inverse[2, 3]
+        if not z > 0.1:
+            continue
+        x = other_inverse[0, 0] * wx + other_inverse[0, 1] * wy + other_inverse[0, 2] * wz + other_inverse[0, 3]
+        y = other_inverse[1, 0] * wx + other_inverse[1, 1] * wy + other_inverse[1, 2] * wz + other_inverse[1, 3]
+        fu, fv = x / z * lens[0] + lens[2], y / z * lens[1] + lens[3]
+        if not (fu > -0.5 and fv > -0.5 and fu < columns - 0.5 and fv < rows - 0.5):
+            continue
+        u, v = int(np.rint(fu)), int(np.rint(fv))
+        nx, ny, nz = grid_normals[v, u]
+        if not nx * nx < 2.0:
+            continue
+        gx, gy, gz = grid[v, u]
+        away = abs(nx * (x - gx) + ny * (y - gy) + nz * (z - gz))
+        if away < reach:
+            out[n] = away
+            n += 1
+    return n

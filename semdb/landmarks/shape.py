@@ -10,15 +10,17 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from semdb.geometry import invert_pose, transform_points
-from semdb.landmarks.lift import LiftedKeyframe
-from semdb.landmarks.options import SeeOptions, ShapeOptions
+from semdb.geometry.sensor import depth_noise
+from semdb.landmarks.boxes import Box, upright_box
+from semdb.landmarks.lift import EXACT, LiftedKeyframe
+from semdb.landmarks.options import ShapeOptions
 from semdb.types import FloatArray
 
 MOST_VIEWS = 48  # that vote on the points of a thing
 
 
 def thing_points(
-    lifted: Sequence[LiftedKeyframe], members: Mapping[int, Sequence[int]], see: SeeOptions, shape: ShapeOptions
+    lifted: Sequence[LiftedKeyframe], members: Mapping[int, Sequence[int]], shape: ShapeOptions
 ) -> FloatArray:
     """Points ``[n, 3]`` (map) of a thing whose sightings are `members`: numbers of sightings by keyframe, ascending.
 
@@ -36,11 +38,47 @@ def thing_points(
     if len(keys) > MOST_VIEWS:
         keys = [keys[k * len(keys) // MOST_VIEWS] for k in range(MOST_VIEWS)]
     for key in keys:
-        _vote(lifted[key], members[key], points, see, visible, inside)
-    kept = inside >= np.maximum(shape.kept_share * visible, 1)
+        _vote(lifted[key], members[key], points, shape, visible, inside)
+    fewest = min(shape.fewest_views, len(keys)) if _noise(lifted, members) < EXACT else 1
+    kept = inside >= np.maximum(shape.kept_share * visible, fewest)
     if np.count_nonzero(kept) < max(8, 0.1 * len(points)):
         return points
     return crowded(points[kept])
+
+
+def thing_box(
+    lifted: Sequence[LiftedKeyframe],
+    members: Mapping[int, Sequence[int]],
+    points: FloatArray,
+    up: FloatArray,
+    shape: ShapeOptions,
+) -> Box:
+    """The upright box about the `points` ``[n, 3]`` of a thing, without what the noise of depth adds to it."""
+    trim = shape.trim if _noise(lifted, members) < EXACT else shape.noisy_trim
+    return upright_box(points, up, trim, noise=thing_noise(lifted, members, shape))
+
+
+def _noise(lifted: Sequence[LiftedKeyframe], members: Mapping[int, Sequence[int]]) -> float:
+    """The median noise of the keyframes that show a thing, as a multiple of `depth_noise`."""
+    return float(np.median([lifted[key].noise for key in sorted(members)]))
+
+
+def thing_noise(
+    lifted: Sequence[LiftedKeyframe], members: Mapping[int, Sequence[int]], shape: ShapeOptions
+) -> FloatArray:
+    """The mean covariance ``[3, 3]`` (map, square metres) of the points of a thing: noise of depth along their rays."""
+    total, number = np.zeros((3, 3)), 0
+    for k, numbers in sorted(members.items()):
+        frame = lifted[k]
+        for s in sorted(numbers):
+            points = frame.outline[s].astype(np.float64)
+            z = points[:, 2]
+            deviation = frame.noise * depth_noise(z) / np.maximum(z, 0.05)  # along z; as a share of the whole ray
+            rays = (points * deviation[:, None]) @ frame.world_from_camera[:3, :3].T
+            single = frame.single[s]
+            total += np.einsum("ni,nj->ij", rays, rays) * (single + (1 - single) * shape.fitted_share**2)
+            number += len(points)
+    return np.asarray(total * shape.noise_share**2 / max(number, 1), np.float64)
 
 
 def crowded(points: FloatArray, reach: float = 0.03, fewest: int = 2) -> FloatArray:
@@ -52,7 +90,12 @@ def crowded(points: FloatArray, reach: float = 0.03, fewest: int = 2) -> FloatAr
 
 
 def _vote(
-    frame: LiftedKeyframe, numbers: Sequence[int], points: FloatArray, see: SeeOptions, visible: object, inside: object
+    frame: LiftedKeyframe,
+    numbers: Sequence[int],
+    points: FloatArray,
+    shape: ShapeOptions,
+    visible: object,
+    inside: object,
 ) -> None:
     from semdb.landmarks.kernels import vote
 
@@ -61,7 +104,8 @@ def _vote(
     mine[np.asarray(numbers) + 1] = True
     distortion = np.array((*camera.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5], np.float64)
     lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], np.float64)
-    limits = np.array([see.near_m, see.near_share, see.through_m, see.through_share, see.silhouette_m])
+    noise = max(frame.noise, shape.least_noise)
+    limits = np.array([shape.near_m + shape.near_deviations * frame.apart, shape.near_deviations * noise])
     step = float(frame.step)
     pose = invert_pose(frame.world_from_camera)
     vote(points, pose, lens, distortion, frame.grid_depth, frame.grid_owner, step, limits, mine, visible, inside)

@@ -17,14 +17,16 @@ import numpy as np
 
 from semdb.compiled import kernel
 from semdb.geometry import invert_pose
-from semdb.landmarks.boxes import Box, upright_box
+from semdb.geometry.sensor import AT_LEAST_M, GROWTH_PER_M, NEAREST_M
+from semdb.landmarks.boxes import Box
 from semdb.landmarks.lift import LiftedKeyframe
-from semdb.landmarks.options import SeeOptions, ShapeOptions, VisitOptions
-from semdb.landmarks.shape import thing_points
+from semdb.landmarks.options import ShapeOptions, VisitOptions
+from semdb.landmarks.shape import thing_box, thing_points
 from semdb.types import FloatArray, Int64Array, IntArray
 
 Members = Mapping[int, Sequence[int]]  # numbers of sightings by keyframe
 SEEN, THROUGH, OCCLUDED = range(3)
+PLANE = 0.001  # 1/m, by which inverse depth may be off a plane at least
 
 
 class Presence(StrEnum):
@@ -61,14 +63,14 @@ def visits_of(
     candidates: Int64Array,
     box: Box,
     up: FloatArray,
-    options: tuple[SeeOptions, ShapeOptions, VisitOptions],
+    options: tuple[ShapeOptions, VisitOptions],
 ) -> tuple[Visit, ...]:
     """The visits of a landmark by number of recording, without those that never had it in view.
 
     `recordings` are those of all keyframes, `members` the sightings of the landmark, `candidates` the keyframes that
     may have it in view, `box` the landmark's.
     """
-    see, shape, visit = options
+    shape, visit = options
     by_visit: dict[int, dict[int, Sequence[int]]] = {}
     for keyframe, numbers in sorted(members.items()):
         by_visit.setdefault(recordings[keyframe], {})[keyframe] = numbers
@@ -76,7 +78,7 @@ def visits_of(
     if len(there) == 1:
         (only,) = there
         return (Visit(only, Presence.PRESENT, len(members), 0, 0, 0, 0, 0, box),)
-    own = {number: thing_points(lifted, part, see, shape) for number, part in by_visit.items()}
+    own = {number: thing_points(lifted, part, shape) for number, part in by_visit.items()}
     found = []
     for number in sorted(there):
         others = [points for other, points in sorted(own.items()) if other != number]
@@ -88,7 +90,7 @@ def visits_of(
         presence = Presence.PRESENT if mine else _without(counts, len(known), visit)
         if not mine and not int(counts.sum()):
             continue
-        shown = upright_box(own[number], up, shape.trim) if mine else None
+        shown = thing_box(lifted, mine, own[number], up, shape) if mine else None
         seen, through, occluded = (int(value) for value in counts)
         found.append(Visit(number, presence, len(mine), len(known), seen, through, occluded, missed, shown))
     return tuple(found)
@@ -106,7 +108,6 @@ def _looked(
 ) -> tuple[IntArray, int]:
     """How many of the `points` ``[n, 3]`` are seen, seen through, occluded, and how many keyframes missed them."""
     votes = np.zeros((len(points), 3), np.int32)
-    limits = np.array([visit.near_m, visit.near_share, visit.through_m, visit.through_share_of_depth])
     missed = 0
     for k in frames:
         frame, camera = lifted[k], lifted[k].camera
@@ -114,6 +115,7 @@ def _looked(
         lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], np.float64)
         before = int(votes[:, SEEN].sum())
         pose = invert_pose(frame.world_from_camera)
+        limits = _limits(frame, visit)
         witness(points, pose, lens, distortion, frame.grid_depth, float(frame.step), limits, votes)
         if k not in members and int(votes[:, SEEN].sum()) - before >= visit.missed_share * max(len(points), 1):
             missed += 1
@@ -123,11 +125,53 @@ def _looked(
     return np.array([seen.sum(), through.sum(), occluded.sum()], np.int32), missed
 
 
+def _limits(frame: LiftedKeyframe, visit: VisitOptions) -> FloatArray:
+    """How near a point is seen, and how far behind it it is seen through: see `witness`."""
+    noise = max(frame.noise, visit.least_noise)
+    near = [visit.near_m, visit.near_deviations * frame.apart, visit.near_deviations * noise]
+    through = [visit.through_m, visit.through_deviations * frame.apart, visit.through_deviations * noise]
+    return np.array([near[0] + near[1], near[2], through[0] + through[1], through[2], noise], np.float64)
+
+
+@kernel
+def off_plane(grid_depth, row, column, u, v, x, y, z, fx, fy, noise):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """How far a point lies before the plane through the nine cells about it, and the share of its depth that counts.
+
+    `u`, `v` are its pixel in cells, `x`, `y` its ray, `fx`, `fy` cells for each unit of these, `noise` that of depth in
+    metres. A plane has an inverse depth that is linear in pixels. The share is 0 where the cells are no plane.
+    """
+    rows, columns = grid_depth.shape
+    if row < 1 or column < 1 or row + 1 >= rows or column + 1 >= columns:
+        return 0.0, 0.0
+    total, right, down = 0.0, 0.0, 0.0
+    for b in range(-1, 2):
+        for a in range(-1, 2):
+            measured = grid_depth[row + b, column + a]
+            if not measured > 0:
+                return 0.0, 0.0
+            total += 1.0 / measured
+            right += a / measured
+            down += b / measured
+    mean, right, down = total / 9.0, right / 6.0, down / 6.0
+    limit = PLANE + 3.0 * noise * mean * mean
+    for b in range(-1, 2):
+        for a in range(-1, 2):
+            if abs(1.0 / grid_depth[row + b, column + a] - mean - a * right - b * down) > limit:
+                return 0.0, 0.0
+    inverse = mean + (u - column - 0.5) * right + (v - row - 0.5) * down
+    across, upright = right * fx, down * fy  # normal of the plane, as long as its distance is near
+    length = np.sqrt(across * across + upright * upright + (inverse - across * x - upright * y) ** 2)
+    if not inverse > 0:
+        return 0.0, 0.0
+    return (1.0 - z * inverse) / length, inverse / length
+
+
 @kernel
 def witness(points, camera_from_world, lens, distortion, grid_depth, scale, limits, votes):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Adds to `votes` int32 ``[n, 3]`` whether a keyframe sees each point float64 ``[n, 3]``, sees through it, or not.
 
-    `limits`: near_m, near_share, through_m, through_share (of the point's depth); the others as in `kernels.look_up`.
+    `limits`: near, through, each in metres and as a multiple of `depth_noise`, and the keyframe's own noise as one; the
+    others as in `kernels.look_up`.
     """
     fx, fy, cx, cy, width, height = lens
     k1, k2, p1, p2, k3 = distortion
@@ -151,23 +195,33 @@ def witness(points, camera_from_world, lens, distortion, grid_depth, scale, limi
             continue
         column = min(int((u + 0.5) / scale), columns - 1)
         row = min(int((v + 0.5) / scale), rows - 1)
+        if not grid_depth[row, column] > 0:
+            continue
+        noise = AT_LEAST_M + GROWTH_PER_M * (z - NEAREST_M) ** 2
+        above, along = off_plane(
+            grid_depth, row, column, u / scale, v / scale, x, y, z, fx / scale, fy / scale, limits[4] * noise
+        )
+        if along > 0:
+            if abs(above) <= limits[0] + limits[1] * noise * along:
+                votes[k, 0] += 1
+            elif above > limits[2] + limits[3] * noise * along:
+                votes[k, 1] += 1
+            elif above < 0:
+                votes[k, 2] += 1
+            continue
         # of the cells around: a surface near the point anywhere speaks for it, farther ones have to be everywhere
         nearest, farthest, least = 1e9, -1e9, 1e9
-        known = False
         for b in range(max(row - 1, 0), min(row + 2, rows)):
             for a in range(max(column - 1, 0), min(column + 2, columns)):
                 measured = grid_depth[b, a]
                 if measured > 0:
                     away = measured - z
-                    known = True
                     farthest = max(farthest, away)
                     least = min(least, away)
                     nearest = min(nearest, abs(away))
-        if not known or not grid_depth[row, column] > 0:
-            continue
-        if nearest <= limits[0] + limits[1] * z:
+        if nearest <= limits[0] + limits[1] * noise:
             votes[k, 0] += 1
-        elif least > limits[2] + limits[3] * z:
+        elif least > limits[2] + limits[3] * noise:
             votes[k, 1] += 1
         elif farthest < 0 or grid_depth[row, column] < z:
             votes[k, 2] += 1

@@ -57,6 +57,18 @@ def test_only_what_was_seen_through_is_gone() -> None:
     assert told(cup(1, once, EMPTY)) == []
 
 
+def test_a_place_that_is_hidden_in_one_visit_may_be_where_a_thing_came_from() -> None:
+    assert told(cup(1, shown(0), EMPTY), cup(2, HIDDEN, shown(0.2))) == [("moved", 1, 2)]
+    # something is seen there, and far away it is another cup
+    there = seen(Presence.UNOBSERVED, points=100, seen=60, occluded=40)
+    assert told(cup(1, shown(0), EMPTY), cup(2, there, shown(0.2))) == [("disappeared", 1, None)]
+    assert told(cup(1, shown(0), EMPTY), cup(2, HIDDEN, shown(9))) == [("disappeared", 1, None)]
+    # half of it is seen through, half is seen
+    half = seen(Presence.UNOBSERVED, points=100, seen=36, seen_through=40)
+    assert told(cup(1, shown(0), half), cup(2, EMPTY, shown(0.2))) == []
+    assert told(cup(1, shown(0), half, RED), cup(2, EMPTY, shown(0.2), RED)) == [("moved", 1, 2)]
+
+
 def test_what_is_gone_here_and_new_there_was_moved_and_each_once() -> None:
     assert told(cup(1, shown(0), EMPTY), cup(2, EMPTY, shown(1))) == [("moved", 1, 2)]
     # two of one kind: each to the nearer place; one too many is gone
@@ -105,7 +117,7 @@ def test_a_keyframe_sees_points_or_sees_through_them_or_does_not() -> None:
     points = np.array([[-0.5, 0, 2.0], [-0.5, 0, 1.5], [-0.5, 0, 2.5], [0.5, 0, 2.0], [-9, 0, 2.0], [-0.5, 0, 1.97]])
     votes = np.zeros((6, 3), np.int32)
     lens = np.array([60.0, 60.0, 32.0, 24.0, 64, 48])
-    limits = np.array([0.02, 0.0, 0.05, 0.0])
+    limits = np.array([0.02, 0.0, 0.05, 0.0, 0.0])
     witness(points, np.eye(4), lens, np.zeros(5), depth, 1.0, limits, votes)
     assert votes.tolist() == [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 0], [0, 0, 0], [0, 0, 0]]
     assert (SEEN, THROUGH) == (0, 1)

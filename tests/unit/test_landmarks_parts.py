@@ -8,10 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semdb.geometry import so3_exp
+from semdb.geometry.sensor import depth_noise
 from semdb.landmarks.boxes import Box, intersection_over_union, shared_area, upright_axes, upright_box
 from semdb.landmarks.clustering import clusters
 from semdb.landmarks.evidence import fuse, name_probabilities
-from semdb.landmarks.lift import SeenObject, apart, lift_keyframe, same_masks
+from semdb.landmarks.kernels import joined_pixels
+from semdb.landmarks.lift import SeenObject, apart, lift_keyframe, measured_noise, same_masks
+from semdb.landmarks.visits import witness
 from semdb.types import Camera
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -132,3 +135,60 @@ def test_without_depth_nothing_has_a_place() -> None:
     camera = Camera(80, 60, 70.0, 70.0, 39.5, 29.5)
     lifted = lift_keyframe(camera, np.eye(4), None, [SeenObject(0, 0.9, square(10, 10, 20))])
     assert [len(points) for points in lifted.points] == [0]
+
+
+def tilted(degrees: float, distance: float, camera: Camera) -> np.ndarray:
+    """Depth ``[H, W]`` of a plane through the point `distance` ahead, turned away about the x axis."""
+    v = np.arange(camera.height, dtype=np.float64)[:, None]
+    y = np.broadcast_to((v - camera.cy) / camera.fy, (camera.height, camera.width))
+    normal = np.array([0.0, np.sin(np.radians(degrees)), np.cos(np.radians(degrees))])
+    return (distance * normal[2] / (normal[1] * y + normal[2])).astype(np.float32)
+
+
+def test_noise_of_depth_is_measured() -> None:
+    camera = Camera(320, 240, 260.0, 260.0, 160.0, 120.0)
+    exact = tilted(50, 2.5, camera)
+    assert measured_noise(camera, exact) < 0.02
+    noisy = exact + np.random.default_rng(0).normal(0, depth_noise(exact)).astype(np.float32)
+    assert 0.85 < measured_noise(camera, noisy) < 1.15
+    assert measured_noise(camera, np.zeros_like(exact)) == 1.0  # nothing is known of it
+
+
+@pytest.mark.parametrize("degrees", [0.0, 70.0])
+def test_a_thing_of_three_centimetres_is_gone_from_its_table_however_flat_it_is_looked_at(degrees: float) -> None:
+    camera = Camera(320, 240, 260.0, 260.0, 160.0, 120.0)
+    depth = tilted(degrees, 3.0, camera)
+    across = np.array([0.0, np.sin(np.radians(degrees)), np.cos(np.radians(degrees))])
+    on_table = np.array([0.0, 0.0, 3.0])
+    points = np.array([on_table, on_table - 0.03 * across, on_table + 0.03 * across])
+    votes = np.zeros((3, 3), np.int32)
+    lens = np.array([260.0, 260.0, 160.0, 120.0, 320, 240])
+    witness(points, np.eye(4), lens, np.zeros(5), depth, 1.0, np.array([0.008, 0.5, 0.012, 0.9, 0.25]), votes)
+    assert votes.tolist() == [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+
+
+def test_what_noise_adds_to_a_side_is_taken_off() -> None:
+    rng = np.random.default_rng(1)
+    back = np.column_stack([rng.uniform(-0.15, 0.15, 2000), np.zeros(2000), rng.uniform(0, 0.2, 2000)])
+    noise = np.diag([0.0, 0.02**2, 0.0])
+    seen = back + rng.normal(0, 0.02, (2000, 1)) * [0, 1, 0]
+    assert upright_box(seen, UP, 0.01).size[:2].min() > 0.08
+    found = upright_box(seen, UP, 0.01, noise=noise)
+    assert found.size[:2].min() < 0.02
+    assert found.size[:2].max() == pytest.approx(0.3, abs=0.01)
+    assert found.size[2] == pytest.approx(0.2, abs=0.01)
+
+
+def test_surfaces_are_followed_to_the_last_pixel() -> None:
+    depth = np.full((20, 30), 2.0, np.float32)
+    owner = np.zeros((20, 30), np.int16)
+    owner[5:15, 5:15] = 1
+    owner[5, 15:25] = 1  # a line of one pixel beside the rest
+    depth[10:15, 14] = 3.0  # behind an edge
+    inner = np.array([row * 30 + column for row in range(7, 13) for column in range(7, 13)])
+    out = np.empty(600, np.int64)
+    number = joined_pixels(depth, owner, 1, inner, len(inner), 0.015, 0.015, out)
+    reached = np.zeros(600, np.bool_)
+    reached[out[:number]] = True
+    assert reached.reshape(20, 30)[5, 15:25].all()
+    assert number == 110 - 5
