@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from semdb.localization.confidence import Evidence
 from semdb.localization.likeness import likeness_by_depth
 from semdb.localization.pose import PoseEstimate
 from semdb.localization.verdict import Judgement
@@ -33,11 +34,12 @@ class Alike:
 class LearnedVerdictOptions:
     """What has to look alike where a learned feature alone is to be believed.
 
-    Chosen on two rendered rooms with their copies, judged on others and on recordings (docs/features.md).
+    Chosen on rendered rooms with their copies, the red kitchen and the cabinet (docs/features.md).
     """
 
-    least_about: float = 0.8  # of rooms of the same shapes 0.58 to 0.77, once 0.87
+    least_about: float = 0.8  # of rooms of the same shapes 0.58 to 0.88
     least_in_all: float = 0.47  # of the same furniture elsewhere at most 0.41
+    least_likeness: float = 0.48  # by the depth of keypoints: of rooms of the same shapes that pass so far mostly 0.45
 
 
 def alike_of(seen: Seen, with_depth: WithDepth) -> Alike | None:
@@ -52,11 +54,20 @@ def alike_of(seen: Seen, with_depth: WithDepth) -> Alike | None:
     return None if shares is None else Alike(*shares)
 
 
-def weigh_learned(judgement: Judgement, alike: Alike | None, options: LearnedVerdictOptions) -> Judgement:
-    """`judgement` of a learned feature alone, by what looks `alike`; as it is where that is not known (None)."""
-    if judgement.verdict is not Verdict.LOCALIZED or alike is None:
+def weigh_learned(
+    judgement: Judgement, evidence: Evidence | None, alike: Alike | None, options: LearnedVerdictOptions
+) -> Judgement:
+    """`judgement` of a learned feature alone, from its `evidence`, by what looks `alike`.
+
+    As it is where that is not known (None).
+    """
+    if judgement.verdict is not Verdict.LOCALIZED or evidence is None or alike is None:
         return judgement
-    if alike.about >= options.least_about and alike.in_all >= options.least_in_all:
+    by_depth = alike.about >= options.least_about and alike.in_all >= options.least_in_all
+    if by_depth and evidence.likeness >= options.least_likeness:
         return judgement
-    doubt = f"only {alike.about:.0%} of what is about the pairs looks alike, {alike.in_all:.0%} of all that is in view"
+    doubt = (
+        f"only {min(alike.about, evidence.likeness):.0%} of what is about the pairs looks alike, "
+        f"{alike.in_all:.0%} of all that is in view"
+    )
     return Judgement(Verdict.AMBIGUOUS, min(judgement.confidence, NO_MORE_THAN), doubt)

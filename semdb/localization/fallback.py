@@ -14,7 +14,7 @@ import numpy as np
 from semdb.database.records import StoredKeyframe
 from semdb.database.store import Store
 from semdb.geometry import invert_pose, pose_error, transform_points
-from semdb.localization.alike import Alike, Seen, WithDepth, alike_of
+from semdb.localization.alike import Alike, LearnedVerdictOptions, Seen, WithDepth, alike_of, weigh_learned
 from semdb.localization.confidence import Evidence
 from semdb.localization.learned_matching import KeypointMatcher, for_learned, is_learned
 from semdb.localization.likeness import small_inverse_depth
@@ -46,6 +46,11 @@ class FallbackOptions:
     same: Tolerance = field(
         default_factory=lambda: Tolerance(0.15, 5.0)
     )  # how far the poses of two features may differ that are one
+    # A keyframe with fewer of the own keypoints is of plain things: that these do not agree says nothing. Those of the
+    # plain cabinet have 230 in the mean, of rooms, kitchen and desk 1100 to 1500.
+    plain: int = 500
+    # What has to look alike then: of the cabinet at least 0.75 of all is, of other plain rooms with its things 0.54
+    alone: LearnedVerdictOptions = field(default_factory=lambda: LearnedVerdictOptions(0.8, 0.65))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,3 +169,27 @@ def weigh_fallback(
     if not (sure and enough and precise and metres <= limit.metres and degrees <= limit.degrees):
         return None
     return Judgement(Verdict.LOCALIZED, max(judgement.confidence, bounds.localized_confidence), judgement.reason)
+
+
+def weigh_alone(
+    before: PoseEstimate | None,
+    evidence: Evidence | None,
+    found: PoseEstimate,
+    anew: Evidence,
+    alike: Alike | None,
+    judgement: Judgement,
+    options: FallbackOptions,
+) -> Judgement | None:
+    """The verdict on the pose that a fallback `found` where the map's own feature sees too little to deny it.
+
+    `judgement` is that of the fallback alone, from its evidence `anew`: it has to be sure, and the query to look
+    `alike`. None where it is not so, or where the own feature has a pose elsewhere.
+    """
+    if alike is None or judgement.verdict is not Verdict.LOCALIZED:
+        return None
+    if before is not None and evidence is not None and evidence.first_inliers >= options.least_own:
+        metres, degrees = pose_error(before.world_from_camera, found.world_from_camera)
+        if metres > options.same.metres or degrees > options.same.degrees:
+            return None
+    weighed = weigh_learned(judgement, anew, alike, options.alone)
+    return weighed if weighed.verdict is Verdict.LOCALIZED else None

@@ -33,6 +33,7 @@ from semdb.localization.fallback import (
     alike_by_depth,
     asked_first,
     fallback_numbers,
+    weigh_alone,
     weigh_fallback,
 )
 from semdb.localization.keyframe_cache import KeyframeCache
@@ -294,7 +295,7 @@ class Localizer:
         search.alike = alike_of(seen, self.cache.with_depth)
         search.timing_ms["pose"] += _ms_since(started)
         if learned is not None and asked:
-            return weigh_learned(judgement, search.alike, learned)
+            return weigh_learned(judgement, evidence, search.alike, learned)
         return judgement if unsure is None else weigh_unsure(search.alike, evidence, judgement, bounds, unsure)
 
     def _ask_fallback(
@@ -334,10 +335,26 @@ class Localizer:
             bounds,
             search.accept,
         )
+        reason = f"{again.estimate.inliers} keypoints of {fallback.name} agree, and with the map's own"
+        if judgement is None:
+            judgement = self._believe_alone(search, again, evidence, found[2], found[1])
+            reason = f"{again.estimate.inliers} keypoints of {fallback.name} agree, where the map has few of its own"
         if judgement is None:
             return search, *settled
-        reason = f"{again.estimate.inliers} keypoints of {fallback.name} agree, and with the map's own"
         return again, found[0], replace(judgement, reason=reason), found[2]
+
+    def _believe_alone(
+        self, search: Search, again: Search, evidence: Evidence | None, anew: Evidence, judgement: Judgement
+    ) -> Judgement | None:
+        """What a fallback says of plain things, on which the map's own feature has hardly a keypoint."""
+        options, seen = FallbackOptions(), best_of(again)
+        if seen is None:
+            return None
+        own = self.cache.views([seen[1].keyframe_id])
+        if not own or len(own[0].view) >= options.plain:
+            return None
+        alike = alike_of(seen, self.cache.fallback_views)
+        return weigh_alone(search.estimate, evidence, seen[2], anew, alike, judgement, options)
 
     def _by_landmarks(self, search: Search, description: Description, judgement: Judgement) -> Judgement:
         """What landmarks make of an image whose keypoints failed; its confidence stays that of the keypoints."""

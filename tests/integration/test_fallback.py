@@ -17,7 +17,7 @@ from semdb.ingestion.run import IngestOptions, ingest_recordings
 from semdb.localization.alike import Alike, LearnedVerdictOptions
 from semdb.localization.coarse import Batch, Proposal, Stage
 from semdb.localization.confidence import Evidence
-from semdb.localization.fallback import Fallback, FallbackOptions, asked_first, weigh_fallback
+from semdb.localization.fallback import Fallback, FallbackOptions, asked_first, weigh_alone, weigh_fallback
 from semdb.localization.images import fallback_of, make_localizer
 from semdb.localization.localizer import Localizer, LocalizerOptions
 from semdb.localization.pose import PoseEstimate
@@ -192,6 +192,25 @@ def test_both_features_have_to_be_sure_together(room: Path, url: str) -> None:
     assert weigh(anew=replace(evidence, inliers=19)) is None
     assert weigh(before=moved) is None
     assert weigh(before=moved, accept=Tolerance(0.3, 5.0)) is not None
+
+    def alone(
+        before: PoseEstimate | None = None,
+        alike: Alike | None = Alike(0.9, 0.8),
+        said: Judgement = judgement,
+        first: int = 16,
+        anew: Evidence = evidence,
+    ) -> Judgement | None:
+        theirs = replace(evidence, first_inliers=first)
+        return weigh_alone(before, theirs, own, anew, alike, said, FallbackOptions())
+
+    assert alone() == judgement
+    assert alone(own) == judgement
+    assert alone(moved) is None  # the own feature has another pose
+    assert alone(moved, first=15) == judgement  # which says nothing
+    assert alone(said=replace(judgement, verdict=Verdict.AMBIGUOUS)) is None
+    assert alone(alike=None) is None
+    assert alone(alike=Alike(0.9, 0.64)) is None
+    assert alone(anew=replace(evidence, likeness=0.45)) is None
 
 
 def test_learned_features_are_believed_where_the_query_looks_alike(room: Path, url: str) -> None:

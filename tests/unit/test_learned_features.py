@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import fields
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,7 @@ import pytest
 from semdb.cli.doctor import learned
 from semdb.errors import ModelError, UsageError
 from semdb.localization.alike import Alike, LearnedVerdictOptions, weigh_learned
+from semdb.localization.confidence import Evidence as PoseEvidence
 from semdb.localization.images import fallback_of
 from semdb.localization.learned_matching import for_learned, is_learned, match_by
 from semdb.localization.localizer import LocalizerOptions
@@ -144,21 +146,25 @@ def test_thresholds_follow_the_feature() -> None:
 
 
 @pytest.mark.parametrize(
-    ("alike", "verdict", "confidence"),
+    ("alike", "likeness", "verdict", "confidence"),
     [
-        (Alike(0.81, 0.48), Verdict.LOCALIZED, 0.97),
-        (Alike(0.79, 0.9), Verdict.AMBIGUOUS, 0.5),  # shapes agree, what is on them does not
-        (Alike(0.95, 0.46), Verdict.AMBIGUOUS, 0.5),  # a thing is there, the rest is another place
-        (None, Verdict.LOCALIZED, 0.97),  # a keyframe without depth
+        (Alike(0.81, 0.48), 0.5, Verdict.LOCALIZED, 0.97),
+        (Alike(0.79, 0.9), 0.9, Verdict.AMBIGUOUS, 0.5),  # shapes agree, what is on them does not
+        (Alike(0.81, 0.9), 0.45, Verdict.AMBIGUOUS, 0.5),
+        (Alike(0.95, 0.46), 0.9, Verdict.AMBIGUOUS, 0.5),  # a thing is there, the rest is another place
+        (None, 0.1, Verdict.LOCALIZED, 0.97),  # a keyframe without depth
     ],
 )
 def test_what_is_learned_counts_where_the_query_looks_alike(
-    alike: Alike | None, verdict: Verdict, confidence: float
+    alike: Alike | None, likeness: float, verdict: Verdict, confidence: float
 ) -> None:
-    found = weigh_learned(Judgement(Verdict.LOCALIZED, 0.97, "so many agree"), alike, LearnedVerdictOptions())
+    numbers = {field.name: 1 for field in fields(PoseEvidence)} | {"likeness": likeness}
+    evidence = PoseEvidence(**numbers)
+    sure = Judgement(Verdict.LOCALIZED, 0.97, "so many agree")
+    found = weigh_learned(sure, evidence, alike, LearnedVerdictOptions())
     assert (found.verdict, found.confidence) == (verdict, confidence)
     doubt = Judgement(Verdict.AMBIGUOUS, 0.4, "in doubt")
-    assert weigh_learned(doubt, alike, LearnedVerdictOptions()) == doubt
+    assert weigh_learned(doubt, evidence, alike, LearnedVerdictOptions()) == doubt
 
 
 def test_a_ceiling_refuses_what_is_nearest_but_unlike() -> None:
