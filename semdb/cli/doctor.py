@@ -134,7 +134,7 @@ def database(settings: Settings) -> Iterator[Check]:
         schema.check_schema(engine)
         yield Check("ok", "schema", f"revision {schema.HEAD}")
         yield from crops(engine)
-        yield from sparse(engine, settings)
+        yield from plain(engine, settings)
     finally:
         engine.dispose()
 
@@ -158,24 +158,23 @@ def crops(engine: Engine) -> Iterator[Check]:
             )
 
 
-def sparse(engine: Engine, settings: Settings) -> Iterator[Check]:
-    """Maps whose keyframes are far apart, where another feature would be sure of more images (docs/features.md)."""
-    from semdb.database.lookups import map_heads
-    from semdb.database.reading import poses
+def plain(engine: Engine, settings: Settings) -> Iterator[Check]:
+    """Maps of plain things, where another feature would be sure of more images (docs/features.md)."""
+    from semdb.database.lookups import map_heads, mean_keypoints
+    from semdb.localization.fallback import FallbackOptions
     from semdb.localization.learned_matching import is_learned
-    from semdb.localization.spacing import spacing_of
 
-    for head in [] if settings.features_fallback else map_heads(engine):
-        if head.damage or is_learned(head.models):
+    counts = {} if settings.features_fallback else mean_keypoints(engine)
+    for head in map_heads(engine) if counts else []:
+        count = counts.get(head.id)
+        if head.damage or count is None or count >= FallbackOptions().plain or is_learned(head.models):
             continue
-        spacing = spacing_of(poses(engine, head.id, bad=lambda *_: None)[1])
-        if spacing is not None and spacing.is_wide:
-            yield Check(
-                "info",
-                f"map {head.name}",
-                f"its keyframes are far apart (to the nearest {spacing} in the median): of images between them many "
-                "may stay in doubt; SEMDB_FEATURES_FALLBACK=onnx:FILE is sure of more, and so are more keyframes",
-            )
+        yield Check(
+            "info",
+            f"map {head.name}",
+            f"its keyframes have {count:.0f} keypoints in the mean, as of plain things: many images may stay in doubt; "
+            "SEMDB_FEATURES_FALLBACK=onnx:FILE is sure of more",
+        )
 
 
 def broker(settings: Settings) -> Iterator[Check]:

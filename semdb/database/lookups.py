@@ -19,6 +19,7 @@ from semdb.database.tables import (
     keyframe_categories,
     keyframe_images,
     keyframes,
+    keypoints,
     map_models,
     maps,
     models,
@@ -70,6 +71,15 @@ def map_id_of(engine: Engine, name: str) -> int | None:
     query = select(maps.c.id).where(maps.c.name == name)
     found = retry.read(engine, lambda connection: connection.execute(query).scalar())
     return None if found is None else int(found)
+
+
+def mean_keypoints(engine: Engine) -> dict[int, float]:
+    """How many keypoints a keyframe has in the mean, by map; of maps with keyframes."""
+    mean = func.avg(keypoints.c["count"])
+    query = select(recordings.c.map_id, mean).select_from(keypoints.join(keyframes).join(recordings))
+    grouped = query.group_by(recordings.c.map_id)
+    rows = retry.read(engine, lambda connection: list(connection.execute(grouped)))
+    return {int(map_id): float(found) for map_id, found in rows if found is not None}
 
 
 def planned_frames(engine: Engine, map_name: str, recording: str) -> tuple[int, ...]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import semdb
-from semdb.cli.doctor import Check, sparse
+from semdb.cli.doctor import Check, plain
 from semdb.database.store import open_store
 from semdb.errors import ModelError, UsageError
 from semdb.geometry import pose_error
@@ -234,16 +234,18 @@ def test_learned_features_are_believed_where_the_query_looks_alike(room: Path, u
 
 def test_doctor_says_where_it_would_help(url: str, tmp_path: Path, room: Path) -> None:
     made = f"sqlite:///{tmp_path / 'few.sqlite3'}"
-    settings = Settings(database_url=made, detector="recorded", encoder="gist", features="orb", threads=1)
+    settings = Settings(
+        database_url=made, detector="recorded", encoder="gist", features="orb", threads=1, max_keypoints=50
+    )
     ingest_recordings([room], settings, IngestOptions(stride=6, map_name="few"))
 
     def said(url: str, settings: Settings) -> list[Check]:
         with open_store(url) as store:
-            return list(sparse(store.engine, settings))
+            return list(plain(store.engine, settings))
 
     [found] = said(made, Settings())
     assert (found.state, found.what) == ("info", "map few")
-    assert "far apart (to the nearest " in found.text
+    assert "have 48 keypoints in the mean, as of plain things" in found.text
     assert "SEMDB_FEATURES_FALLBACK=onnx:FILE" in found.text
     assert said(made, Settings(features_fallback="sift")) == []
     assert said(url, Settings()) == []
