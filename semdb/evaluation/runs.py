@@ -322,12 +322,19 @@ def _add_frames(info: MapInfo, task: Task, describer: Describer, store: Store, p
     """Frames beside the keyframes, but for queries and the two on each side of them. Raises UsageError."""
     if task.truth == REFINED:
         raise UsageError(f"{SEMDB_FRAMES} needs --truth given: only keyframes and queries have refined poses")
+    free = 0
     for part in task.keyframes:
         name, order = part.recording.name, [entry.index for entry in part.recording.entries]
         asked = {entry.index for other in task.queries if other.recording.name == name for entry in other.entries}
         at = [n for n, index in enumerate(order) if index in asked]
         near = {order[m] for n in at for m in range(max(0, n - NEAR), min(len(order), n + NEAR + 1))}
+        free += len(set(order) - near - {entry.index for entry in part.entries})
         add_frames(store, info, part.recording, describer, without=near, progress=progress)
+    if not free:
+        raise UsageError(
+            f"{task.name}: every frame is a keyframe, a query or within {NEAR} frames of one, so {SEMDB_FRAMES} "
+            "has none to add: ask fewer with --max-queries"
+        )
 
 
 def _fill(options: IngestOptions, task: Task, describer: Describer, store: Store, progress: Progress | None) -> None:

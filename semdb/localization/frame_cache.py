@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from semdb.database.frame_views import FrameHead, FrameRow, load_frame_heads, load_frames
 from semdb.database.store import Store
 from semdb.errors import CodecError, FrameError
-from semdb.geometry import pose_distances
+from semdb.geometry import POSE_UNIT_M, pose_distances
 from semdb.localization.views import ClassNumbers, KeyframeView, make_keyframe_view
 from semdb.recordings.images import decode_color_grey
-from semdb.types import FloatArray, ImageArray
+from semdb.types import FloatArray, ImageArray, IntArray
 
 CAPACITY = 64  # about 1 MiB each
 
@@ -26,11 +26,12 @@ class FrameCache:
         self._map_id = map_id
         self._numbers = numbers
         self._heads: list[FrameHead] | None = None
+        self._placed: tuple[FloatArray, IntArray, FloatArray] | None = None  # for these keyframes: heads, poses
         self._views: OrderedDict[int, tuple[KeyframeView, FloatArray]] = OrderedDict()
 
     def forget(self) -> None:
         """Reads all anew when it is asked for."""
-        self._heads = None
+        self._heads, self._placed = None, None
         self._views.clear()
 
     def head(self, view_id: int) -> FrameHead:
@@ -38,28 +39,40 @@ class FrameCache:
         return self._known()[-view_id - 1]
 
     def near(
-        self, pose: FloatArray, limit: float, count: int, keyframes: Mapping[int, FloatArray]
+        self, pose: FloatArray, limit: float, count: int, keyframe_ids: Sequence[int], keyframes: FloatArray
     ) -> list[KeyframeView]:
         """The `count` nearest to `pose` less than `limit` away (`pose_distances`), nearest first.
 
-        `keyframes` are the poses ``[4, 4]`` of keyframes in the world.
+        `keyframe_ids`, ascending, and `keyframes` ``[n, 4, 4]`` are those of all keyframes and where they are.
         """
-        known = [(n, head) for n, head in enumerate(self._known()) if head.keyframe_id in keyframes]
-        if not known:
+        if not self._known():
             return []
-        poses = np.stack([keyframes[head.keyframe_id] @ head.keyframe_from_camera for _, head in known])
-        distance = pose_distances(pose, poses)
-        order = [int(n) for n in np.argsort(distance, kind="stable") if distance[n] < limit][:count]
-        self._load({-known[n][0] - 1: poses[n] for n in order})
+        if self._placed is None or self._placed[0] is not keyframes:
+            self._placed = keyframes, *self._place(keyframe_ids, keyframes)
+        _, rows, poses = self._placed
+        # the distance is at least that of the positions alone: turns are worked out for few
+        close = np.flatnonzero(((poses[:, :3, 3] - pose[:3, 3]) ** 2).sum(axis=1) < (limit * POSE_UNIT_M) ** 2)
+        distance = pose_distances(pose, poses[close])
+        nearest = [int(close[n]) for n in np.argsort(distance, kind="stable") if distance[n] < limit][:count]
+        wanted = {-int(rows[n]) - 1: poses[n] for n in nearest}
+        self._load(wanted)
         found = []
-        for n in order:
-            view = self._views.get(-known[n][0] - 1)
-            if view is not None:
-                self._views.move_to_end(-known[n][0] - 1)
-                found.append(view[0])
+        for key in wanted:
+            if key in self._views:
+                self._views.move_to_end(key)
+                found.append(self._views[key][0])
         while len(self._views) > CAPACITY:
             self._views.popitem(last=False)
         return found
+
+    def _place(self, keyframe_ids: Sequence[int], keyframes: FloatArray) -> tuple[IntArray, FloatArray]:
+        """Which heads ``[m]`` have a keyframe that is there, and their poses ``[m, 4, 4]`` in the world."""
+        heads, ids = self._known(), np.asarray(keyframe_ids, np.int64)
+        owners = np.array([head.keyframe_id for head in heads], np.int64)
+        at = np.minimum(np.searchsorted(ids, owners), max(len(ids) - 1, 0))
+        rows = np.flatnonzero(ids[at] == owners) if len(ids) else np.zeros(0, np.int64)
+        relative = np.stack([heads[n].keyframe_from_camera for n in rows]) if len(rows) else np.zeros((0, 4, 4))
+        return rows.astype(np.int32), keyframes[at[rows]] @ relative
 
     def _known(self) -> list[FrameHead]:
         if self._heads is None:

@@ -164,7 +164,7 @@ class KeyframeCache:
             return []
         with self._turn:
             ids, poses = self._read_poses()
-            found = self._frames.near(pose, limit, count, dict(zip(ids, poses, strict=True)))
+            found = self._frames.near(pose, limit, count, ids, poses)
             errors = self._known_errors()
             return [
                 replace(one, pose_errors=errors.get(self._frames.head(one.keyframe_id).recording_id)) for one in found

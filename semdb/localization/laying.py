@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from semdb.localization.alike import WithDepth, alike_of
 from semdb.localization.confidence import Evidence
 from semdb.localization.edge_alignment import measure_edges, search_edges
 from semdb.localization.edge_step import EdgeVerdictOptions, weigh_edges
@@ -12,7 +13,7 @@ from semdb.localization.edges import image_edges
 from semdb.localization.keyframe_cache import KeyframeCache
 from semdb.localization.laid_pose import LaidOptions, LaidPose, estimate_with, is_one, judge_with, may_overrule
 from semdb.localization.pose import PoseEstimate, find_rival
-from semdb.localization.search import Search, evidence_of
+from semdb.localization.search import Search, evidence_of, seen_by
 from semdb.localization.surface_search import search_surfaces
 from semdb.localization.surface_step import SurfaceVerdictOptions, weigh_surfaces
 from semdb.localization.surfaces import Surfaces, surfaces_of
@@ -83,6 +84,7 @@ def with_laid(
     convinced: bool,
     judgement: Judgement,
     evidence: Evidence | None,
+    with_depth: WithDepth,
 ) -> tuple[Judgement, Evidence | None]:
     """Verdict and evidence after a query was laid on the map; the pose with them."""
     before, overrule = search.estimate, False
@@ -92,6 +94,9 @@ def with_laid(
         rival = rival_of(search, found)
         anew = evidence_of(search, found, 0 if rival is None else rival.inliers)
         overrule = may_overrule(convinced, anew, laid, options)
+        if overrule and options.least_alike_in_all > 0:
+            search.alike = alike_of(seen_by(search, found), with_depth)
+            overrule = search.alike is None or search.alike.in_all >= options.least_alike_in_all
         if overrule:
             search.estimate, evidence = found, anew
             search.others.clear()

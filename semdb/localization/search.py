@@ -63,9 +63,11 @@ def evidence_of(search: Search, estimate: PoseEstimate, rival: int) -> Evidence:
 
 def best_of(search: Search) -> Seen | None:
     """The query, the keyframe that has most inliers, the pose, and its number there; None where there is none."""
-    estimate = search.estimate
-    if estimate is None:
-        return None
+    return None if search.estimate is None else seen_by(search, search.estimate)
+
+
+def seen_by(search: Search, estimate: PoseEstimate) -> Seen:
+    """The same of any pose of what was matched."""
     own = (n for n in range(len(estimate.per_keyframe)) if search.keyframes[n].keyframe_id > 0)
     best = max(own, key=estimate.per_keyframe.__getitem__)  # of frames beside keyframes no depth is kept
     return search.query, search.keyframes[best], estimate, best

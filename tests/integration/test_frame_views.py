@@ -15,6 +15,7 @@ from semdb.cli.main import app
 from semdb.database.frame_views import FrameHead, FrameRow, load_frame_heads, load_frames, write_frame_views
 from semdb.database.store import Store, open_store
 from semdb.errors import RecordingError, UsageError
+from semdb.evaluation.runner import EvaluateOptions, evaluate
 from semdb.geometry import pose_error
 from semdb.ingestion.frames import add_frames
 from semdb.localization.images import make_localizer
@@ -159,3 +160,15 @@ def test_the_command(room: Path, url: str, tmp_path: Path) -> None:
         store.delete_keyframes([gone])
         left = load_frame_heads(store.engine, 1)
         assert {head.keyframe_id for head in left} == {head.keyframe_id for head in heads} - {gone}
+
+
+def test_the_row_of_evaluations_has_frames_that_are_far_from_queries(room: Path, tmp_path: Path) -> None:
+    settings = Settings(detector="recorded", encoder="gist", database_url=f"sqlite:///{tmp_path}/x", threads=1)
+    methods = ("semdb", "semdb-frames")
+    own, frames = evaluate([room], settings, EvaluateOptions(methods, keyframes=(3,), max_queries=3))
+    assert (own.method, frames.method) == methods
+    assert own.localized <= frames.localized == 3
+    inliers = [sum(query.inliers for query in result.per_query) for result in (own, frames)]
+    assert inliers[1] > inliers[0]
+    with pytest.raises(UsageError, match="has none to add: ask fewer"):
+        evaluate([room], settings, EvaluateOptions(methods[1:], keyframes=(3,), max_queries=12))

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -15,6 +16,7 @@ from semdb.types import Camera, Float32Array, FloatArray, ImageArray
 AMBIENT_REACH = 0.9  # metres: nearer surfaces take away ambient light
 DIRECTIONS = 32
 LEAF = 4  # primitives
+SOFT = 3.0  # texels of baked light
 _EXPOSURE = 1.0
 
 
@@ -91,6 +93,18 @@ def bake_light(scene: PackedScene, lamps: list[Lamp]) -> PackedScene:
     # textures are kept as displayed (gamma 2.2), so light is brought to the same scale
     shown = (_EXPOSURE * light) ** (1 / 2.2)
     return replace(scene, light=shown.astype(np.float32))
+
+
+def soften_light(scene: PackedScene) -> PackedScene:
+    """`scene` with its baked light blurred on every face: what few directions leave of steps on it is no texture."""
+    light = scene.light.copy()
+    for offset, columns, rows in scene.light_map.reshape(-1, 3):
+        if offset >= 0 and min(columns, rows) > 1:
+            of_face = slice(offset, offset + columns * rows)
+            face = np.ascontiguousarray(light[of_face].reshape(rows, columns, 3))
+            soft = cv2.GaussianBlur(face, (0, 0), SOFT, borderType=cv2.BORDER_REFLECT)
+            light[of_face] = soft.reshape(-1, 3)
+    return replace(scene, light=light)
 
 
 def _cull(scene: PackedScene, camera: Camera, pose: FloatArray, tile: int) -> tuple[Int64Array, Int64Array, FloatArray]:

@@ -24,7 +24,7 @@ from semdb.recordings.synthetic.mistakes import make_mistakes, with_misnamed
 from semdb.recordings.synthetic.options import BETWEEN_ROOMS_M, DEPTH_SCALE, FRAME_RATE_HZ, SyntheticOptions
 from semdb.recordings.synthetic.person import CATEGORY as PERSON
 from semdb.recordings.synthetic.person import walker_for
-from semdb.recordings.synthetic.render import Lamp, bake_light, render_view
+from semdb.recordings.synthetic.render import Lamp, bake_light, render_view, soften_light
 from semdb.recordings.synthetic.room import Room, build_room
 from semdb.recordings.synthetic.scene import PackedScene, bare, mirrored, pack, plain, yaw_pose
 from semdb.recordings.synthetic.trajectory import walk
@@ -70,7 +70,8 @@ def _scene(
     elif is_plain:
         items = plain(items)
     kept = tuple(label for label in moved if label not in taken)
-    return room, bake_light(pack(items), _lamps(room)), kept, tuple(taken)
+    lit = bake_light(pack(items), _lamps(room))
+    return room, soften_light(lit) if is_bare else lit, kept, tuple(taken)
 
 
 def _lamps(room: Room) -> list[Lamp]:
