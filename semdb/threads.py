@@ -7,7 +7,7 @@ on it, so `each` is not called from within `each`.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from typing import TypeVar
@@ -32,6 +32,16 @@ def each(work: Callable[[Item], Result], items: Sequence[Item], threads: int) ->
         return [work(item) for item in items]
     others = [_pool(threads - 1).submit(work, item) for item in items[1:]]
     return [work(items[0]), *(other.result() for other in others)]
+
+
+def ahead(items: Iterator[Item]) -> Iterator[Item]:
+    """The same items, each worked out while the one before it is used; by one thread, which is not of the pool."""
+    nothing = object()
+    with ThreadPoolExecutor(1, thread_name_prefix="semdb-ahead") as other:
+        coming = other.submit(next, items, nothing)
+        while (item := coming.result()) is not nothing:
+            coming = other.submit(next, items, nothing)
+            yield item  # type: ignore[misc]
 
 
 @lru_cache(maxsize=MOST)

@@ -107,7 +107,12 @@ def decode_vectors(
     if not len(blobs):
         return np.empty((0, size or 0), np.float32)
     joined = _equal_vectors(blobs)
-    if joined is not None and size in (None, joined.shape[1]) and (np.abs(joined) <= _MOST_OF_UNIT).all():
+    if (
+        joined is not None
+        and size in (None, joined.shape[1])
+        and joined.max() <= _MOST_OF_UNIT  # neither holds for NaN
+        and joined.min() >= -_MOST_OF_UNIT
+    ):
         return joined
     found = [_vector(blob, int(key)) for blob, key in zip(blobs, keys, strict=True)]
     sizes = Counter(len(vector) for vector in found if not isinstance(vector, CodecError))
@@ -141,13 +146,17 @@ def _equal_vectors(blobs: Sequence[Any]) -> Float32Array | None:
     tail, seed = struct.pack("<I", (size - start) // 4), crc32(head)
     if head != first or blobs[0][_HEADER.size : start] != tail:
         return None
+    found = np.empty((len(blobs), (size - start) // 4), np.dtype("<f4"))
+    out, at = found.reshape(-1).view(np.uint8).data, 0
     for blob in blobs:
         if len(blob) != size or blob[:_CHECKED] != head or blob[_HEADER.size : start] != tail:
             return None
-        if crc32(memoryview(blob)[_HEADER.size :], seed) != int.from_bytes(blob[_CHECKED : _HEADER.size], "little"):
+        view = memoryview(blob)
+        if crc32(view[_HEADER.size :], seed) != int.from_bytes(blob[_CHECKED : _HEADER.size], "little"):
             return None
-    joined = np.frombuffer(b"".join(blobs), np.uint8).reshape(len(blobs), size)
-    return np.ascontiguousarray(joined[:, start:]).view("<f4").astype(np.float32, copy=False)
+        out[at : at + size - start] = view[start:]
+        at += size - start
+    return found.astype(np.float32, copy=False)
 
 
 def _vector(blob: Any, key: int) -> Float32Array | CodecError:

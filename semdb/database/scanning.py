@@ -14,11 +14,13 @@ from sqlalchemy.sql.elements import ColumnElement
 
 from semdb.class_score import MOST_OBJECTS, Part, word
 from semdb.database import checked, retry
+from semdb.database.blobs import in_bulk
 from semdb.database.codecs import decode_vectors
 from semdb.database.exact_sums import exact_sum, whole
-from semdb.database.reading import Bad, by_own_encoder, encoder_id, keyframe_ids
+from semdb.database.reading import Bad, by_own_encoder, encoder_id
 from semdb.database.tables import categories, cnn_vectors, keyframe_categories, keyframes, maps, recordings
 from semdb.errors import CodecError
+from semdb.threads import ahead
 from semdb.types import Float32Array, Int64Array
 
 IN_CHUNK = 500
@@ -36,12 +38,38 @@ def iter_vectors(
     Each chunk is a transaction of its own, so a keyframe that is deleted meanwhile is left out. `size` and `bad` as in
     `vectors_there`; without `size` it is that of the first chunk. All are by the encoder that the map has at first.
     """
-    ids = np.array(keyframe_ids(engine, map_id), np.int64)
+    ids = _map_ids(engine, map_id)
     encoder = retry.read(engine, lambda connection: encoder_id(connection, map_id))
-    for start in range(0, len(ids), chunk):
-        found, vectors = vectors_there(engine, ids[start : start + chunk], size, bad, encoder)
+    starts = range(0, len(ids), chunk)
+    for rows, without in ahead(_fetched(engine, ids[start : start + chunk], encoder) for start in starts):
+        _tell_missing(without, bad)
+        found, vectors = _decoded(rows, size, bad)
         size = vectors.shape[1] if len(found) else size
         yield found, vectors
+
+
+def _map_ids(engine: Engine, map_id: int) -> Int64Array:
+    """The keyframes of a map ``[n]``, ascending; in several transactions."""
+    k = keyframes.c
+    query = select(k.id.label("number")).join(recordings, recordings.c.id == k.recording_id)
+    query = query.where(recordings.c.map_id == map_id).order_by(k.id).limit(FETCH)
+    pieces, last = [np.empty(0, np.int64)], -(2**63)
+    while True:
+        numbers = retry.read(engine, partial(_numbers, query=query.where(k.id > last), step=1))
+        pieces.append(numbers)
+        if len(numbers) < FETCH:
+            return np.concatenate(pieces)
+        last = int(numbers[-1])
+
+
+def _fetched(engine: Engine, ids: Int64Array, encoder: int | None) -> tuple[list[tuple[int, bytes]], list[int]]:
+    """Rows of those of `ids` (ascending) that are there, and those without one."""
+
+    def work(connection: Connection) -> tuple[list[tuple[int, bytes]], list[int]]:
+        rows = _rows(connection, ids, encoder)
+        return rows, _without_row(connection, ids, rows)
+
+    return retry.read(engine, work)
 
 
 def vectors_there(
@@ -54,13 +82,7 @@ def vectors_there(
     `size` is how many numbers they have to have, by default as many as most have. A damaged one is zero and told to
     `bad`, or raises CodecError; so is a keyframe that has none, which is left out.
     """
-    wanted = np.unique(ids)
-
-    def work(connection: Connection) -> tuple[list[tuple[int, bytes]], list[int]]:
-        rows = _rows(connection, wanted, encoder)
-        return rows, _without_row(connection, wanted, rows)
-
-    rows, without = retry.read(engine, work)
+    rows, without = _fetched(engine, np.unique(ids), encoder)
     _tell_missing(without, bad)
     return _decoded(rows, size, bad)
 
@@ -234,8 +256,9 @@ def _rows(connection: Connection, ids: Int64Array, encoder: int | None) -> list[
     first, last = int(ids[0]), int(ids[-1])
     if len(ids) >= DENSE * (last - first + 1):
         keys = set(ids.tolist())
-        found = connection.execute(query.where(c.keyframe_id.between(first, last)))
-        return [(row[0], row[1]) for row in found if row[0] in keys]
+        with in_bulk(connection), connection.execute(query.where(c.keyframe_id.between(first, last))) as result:
+            found = result.cursor.fetchall()  # plain tuples: nothing is to be made of their values
+        return [row for row in found if row[0] in keys]
     return [
         (row[0], row[1])
         for keys in _in_chunks(ids.tolist())

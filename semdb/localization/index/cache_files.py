@@ -13,7 +13,6 @@ import os
 import struct
 import time
 import uuid
-import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
+from isal.isal_zlib import crc32
 
 from semdb.errors import SemdbError
 from semdb.localization.index.vectors import Part
@@ -67,11 +67,11 @@ def write_arrays(path: Path, header: Mapping[str, Any], arrays: Mapping[str, npt
     described, start = [], 0
     for name, array in arrays.items():
         flat = np.ascontiguousarray(array)
-        described.append([name, flat.dtype.str, list(flat.shape), start, zlib.crc32(flat.data)])
+        described.append([name, flat.dtype.str, list(flat.shape), start, crc32(flat.data)])
         start += flat.nbytes
     text = json.dumps({"header": header, "arrays": described}).encode()
     with _written(path) as file:
-        file.write(_ARRAYS.pack(ARRAYS_MAGIC, len(text), zlib.crc32(text)) + text)
+        file.write(_ARRAYS.pack(ARRAYS_MAGIC, len(text), crc32(text)) + text)
         for array in arrays.values():
             file.write(np.ascontiguousarray(array).data)
 
@@ -86,7 +86,7 @@ def read_arrays(path: Path) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]
         if magic != ARRAYS_MAGIC:
             raise CacheError("it is of another kind or version")
         text = file.read(size)
-        if len(text) != size or zlib.crc32(text) != checksum:
+        if len(text) != size or crc32(text) != checksum:
             raise CacheError("its header is damaged")
         content = json.loads(text)
         first = file.tell()
@@ -101,7 +101,7 @@ def _read_array(
     file.seek(first + start)
     if array.nbytes and file.readinto(array.reshape(-1).view(np.uint8).data) != array.nbytes:  # type: ignore[attr-defined]
         raise CacheError(f"the array {name} is truncated")
-    if zlib.crc32(array.data) != checksum:
+    if crc32(array.data) != checksum:
         raise CacheError(f"the array {name} is damaged")
     return array
 
@@ -109,20 +109,19 @@ def _read_array(
 def write_vectors(folder: Path, pieces: Iterable[Float32Array], size: int) -> VectorFile:
     """Writes pieces ``[n, size]`` one after the other as one file. Raises OSError."""
     name = f"vectors-{uuid.uuid4().hex}.f32"
-    rows, checksums, rest = 0, [], b""
-    step = CHECK_ROWS * size * 4
+    rows, checksums = 0, [0]
     with _written(folder / name) as file:
         file.write(bytes(_VECTORS.size))
         for piece in pieces:
-            rows += len(piece)
-            data = np.ascontiguousarray(piece, "<f4").tobytes()
-            file.write(data)
-            rest += data
-            whole = len(rest) - len(rest) % step
-            checksums += [zlib.crc32(memoryview(rest)[begin : begin + step]) for begin in range(0, whole, step)]
-            rest = rest[whole:]
-        if rest:
-            checksums.append(zlib.crc32(rest))
+            data = np.ascontiguousarray(piece, "<f4")
+            file.write(data.data)
+            start = 0
+            while start < len(data):  # up to where the next checksum begins
+                stop = min(len(data), start + CHECK_ROWS - rows % CHECK_ROWS)
+                checksums[-1] = crc32(data[start:stop].data, checksums[-1])
+                rows, start = rows + stop - start, stop
+                checksums += [0] * (rows % CHECK_ROWS == 0)
+        checksums = checksums[: -(-rows // CHECK_ROWS)]
         file.seek(0)
         file.write(_VECTORS.pack(VECTORS_MAGIC, bytes.fromhex(name[8:40]), rows, size))
     return VectorFile(name, rows, tuple(checksums))
@@ -157,7 +156,7 @@ def _check_vectors(part: Part, file: VectorFile, size: int) -> None:
     most = max(1, CHECKED_BYTES // (CHECK_ROWS * size * 4))
     for block in np.unique(np.linspace(0, blocks - 1, min(blocks, most)).astype(int)).tolist():
         piece = part.array[block * CHECK_ROWS : (block + 1) * CHECK_ROWS]
-        if zlib.crc32(piece.data) != file.checksums[block]:
+        if crc32(piece.data) != file.checksums[block]:
             raise CacheError(f"{file.name} is damaged near row {block * CHECK_ROWS}")
         part.passed(len(piece))
     part.bounded = False

@@ -14,7 +14,7 @@ import numpy as np
 from semdb.localization.index.kernels import CodeArray
 from semdb.types import Float32Array
 
-SAMPLE = 16_384  # vectors that the components are found from
+SAMPLE = 8192  # vectors that the components are found from
 ROUNDS = 3  # of the subspace iteration
 EXTRA = 16  # components more than asked for while iterating
 LARGEST = 127
@@ -31,7 +31,8 @@ class Reduction:
 
     def encode(self, vectors: Float32Array) -> CodeArray:
         """Codes int8 ``[n, components]`` of vectors ``[n, d]``."""
-        codes = (vectors - self.mean) @ self.axes.T
+        codes = vectors @ self.axes.T
+        codes -= self.axes @ self.mean
         codes /= self.scales
         return np.clip(np.rint(codes, out=codes), -LARGEST, LARGEST, out=codes).astype(np.int8)
 
