@@ -243,9 +243,10 @@ def view_of(entry: OpenMap, query: QueryImage) -> View:
 
     from semdb.localization.views import make_view
     from semdb.perception.lifting import lift
+    from semdb.perception.quality import with_contrast
     from semdb.types import Keypoints
 
-    grey = np.asarray(cv2.cvtColor(query.image, cv2.COLOR_RGB2GRAY), np.uint8)
+    grey, _ = with_contrast(np.asarray(cv2.cvtColor(query.image, cv2.COLOR_RGB2GRAY), np.uint8))
     features = entry.describer.features.extract(grey)
     points = lift(query.camera, query.depth, features.xy)
     keypoints = Keypoints(features, np.full(len(features), -1, np.int32), points)

@@ -12,7 +12,7 @@ from semdb.localization.bundle import BundleProblem, BundleResult, adjust, pixel
 from semdb.localization.pairs import NEAREST_M, Pairs
 from semdb.localization.pose_options import PoseOptions
 from semdb.localization.views import KeyframeView, View
-from semdb.types import BoolArray, FloatArray, IntArray
+from semdb.types import BoolArray, Float32Array, FloatArray, IntArray
 
 
 def in_front(points: FloatArray) -> FloatArray:
@@ -26,16 +26,23 @@ def project_adjusted(query: View, keyframes: Sequence[KeyframeView], adjusted: B
 
     All images stand and turn as `adjusted` found; the points are those measured in the keyframes.
     """
-    projected = []
-    for slot, keyframe in enumerate(keyframes, start=1):
-        local = keyframe.view.points.astype(np.float64)
-        local -= _crossed(adjusted.turn[slot] * keyframe.view.image_row[:, None], local)
-        world = transform_points(invert_pose(adjusted.image_from_world[slot]), local)
-        seen = transform_points(adjusted.camera_from_world, world)
-        # the row that sees a point, to first order where it would be without a turn
-        row = np.clip(in_front(seen)[:, 1:] * query.focal / query.camera.height, -0.5, 0.5)
-        projected.append(in_front(seen + _crossed(adjusted.turn[0] * row, seen)) * query.focal)
-    return projected
+    return [
+        _projected(query, adjusted, slot, keyframe.view.points, keyframe.view.image_row)
+        for slot, keyframe in enumerate(keyframes, start=1)
+    ]
+
+
+def _projected(
+    query: View, adjusted: BundleResult, slot: int, points: Float32Array, image_row: FloatArray
+) -> FloatArray:
+    """As `project_adjusted`, of `points` ``[n, 3]`` that image `slot` sees in these rows ``[n]``."""
+    local = points.astype(np.float64)
+    local -= _crossed(adjusted.turn[slot] * image_row[:, None], local)
+    world = transform_points(invert_pose(adjusted.image_from_world[slot]), local)
+    seen = transform_points(adjusted.camera_from_world, world)
+    # the row that sees a point, to first order where it would be without a turn
+    row = np.clip(in_front(seen)[:, 1:] * query.focal / query.camera.height, -0.5, 0.5)
+    return in_front(seen + _crossed(adjusted.turn[0] * row, seen)) * query.focal
 
 
 def _crossed(one: FloatArray, two: FloatArray) -> FloatArray:
@@ -117,5 +124,18 @@ def projected_error_px(query: View, pairs: Pairs, projected: Sequence[FloatArray
     for slot, there in enumerate(projected):
         here = pairs.slot == slot
         offset = there[pairs.keypoint[here]] - query.xy[pairs.query[here]] * query.focal
+        error[here] = np.hypot(offset[:, 0], offset[:, 1])
+    return np.where(np.isfinite(error), error, np.inf)
+
+
+def pairs_error_px(query: View, keyframes: Sequence[KeyframeView], pairs: Pairs, adjusted: BundleResult) -> FloatArray:
+    """`projected_error_px` where only the points of pairs are projected, which is less work."""
+    error = np.full(len(pairs), np.inf)
+    for slot, keyframe in enumerate(keyframes):
+        here = np.flatnonzero(pairs.slot == slot)
+        rows = pairs.keypoint[here]
+        view = keyframe.view
+        there = _projected(query, adjusted, slot + 1, view.points[rows], view.image_row[rows])
+        offset = there - query.xy[pairs.query[here]] * query.focal
         error[here] = np.hypot(offset[:, 0], offset[:, 1])
     return np.where(np.isfinite(error), error, np.inf)

@@ -10,7 +10,13 @@ import numpy as np
 import poselib
 
 from semdb.geometry import invert_pose, pose_error, transform_points
-from semdb.localization.adjustment import bundle_adjust, in_front, project_adjusted, projected_error_px
+from semdb.localization.adjustment import (
+    bundle_adjust,
+    in_front,
+    pairs_error_px,
+    project_adjusted,
+    projected_error_px,
+)
 from semdb.localization.alignment import Alignment, align_pairs
 from semdb.localization.bundle import QUERY, BundleResult
 from semdb.localization.learned_matching import KeypointMatcher, match_by
@@ -277,10 +283,14 @@ def _refine(
         seen = Alignment(query.xy[pairs.query], np.zeros(len(pairs), np.bool_))
         return pairs, projected_error_px(query, pairs, projected), adjusted, seen
     adjusted = bundle_adjust(query, keyframes, used, points[agreeing], camera_from_world, options)
-    matching = replace(options.matching, guided_radius_px=options.close_radius_px)
-    projected = project_adjusted(query, keyframes, adjusted)
-    pairs = guided_pairs(query, keyframes, projected, matching)
-    agreeing = projected_error_px(query, pairs, projected) < options.inlier_px
+    if options.rematched:
+        matching = replace(options.matching, guided_radius_px=options.close_radius_px)
+        projected = project_adjusted(query, keyframes, adjusted)
+        pairs = guided_pairs(query, keyframes, projected, matching)
+        error = projected_error_px(query, pairs, projected)
+    else:
+        error = pairs_error_px(query, keyframes, pairs, adjusted)
+    agreeing = error < options.inlier_px
     if agreeing.sum() < MINIMUM_PAIRS:
         raise np.linalg.LinAlgError("too few pairs are left")
     agreeing = _thinned(agreeing, options.most_pairs)
@@ -290,7 +300,11 @@ def _refine(
     adjusted = bundle_adjust(query, keyframes, used, points, pose, options, alignment, start=adjusted)
     seen = Alignment(query.xy[pairs.query], np.zeros(len(pairs), np.bool_))
     seen.xy[agreeing], seen.found[agreeing] = alignment.xy, alignment.found
-    return pairs, projected_error_px(query, pairs, project_adjusted(query, keyframes, adjusted)), adjusted, seen
+    if options.rematched:
+        error = projected_error_px(query, pairs, project_adjusted(query, keyframes, adjusted))
+    else:
+        error = pairs_error_px(query, keyframes, pairs, adjusted)
+    return pairs, error, adjusted, seen
 
 
 def _thinned(agreeing: BoolArray, most: int | None) -> BoolArray:

@@ -26,4 +26,5 @@ class PoseOptions:
     use_query_depth: bool = True
     motion: MotionPrior = field(default_factory=MotionPrior)
     threads: int = field(default_factory=cores)  # keyframes are worked on side by side
+    rematched: bool = True  # once images' turns are known; else the pairs of before are kept that agree then
     most_pairs: int | None = None  # that are adjusted, evenly taken of all; None: every one

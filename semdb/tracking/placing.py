@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import poselib
 
-from semdb.geometry import invert_pose, transform_points
+from semdb.geometry import invert_pose, so3_log, transform_points
 from semdb.localization.adjustment import in_front
 from semdb.localization.confidence import gather_evidence, sigmas
 from semdb.localization.matching import Matches, no_matches
@@ -34,6 +34,8 @@ from semdb.types import FloatArray, Verdict
 LEAST_STEP_PAIRS = 25
 STEP_PX = 3.0  # of pairs of two images that agree on a step
 CAUCHY_PX = 1.0
+FIT_ITERATIONS = 25  # of a pose from a start; the last ones change nothing that matters
+STEP_RADIUS_PX = 40.0  # around where the motion before puts a point
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,7 +122,7 @@ def _fitted(view: View, start: FloatArray, pairs: Pairs, points: FloatArray, sca
     pixels = view.xy[pairs.query] * view.focal
     fitted, _ = poselib.refine_absolute_pose(
         pixels, points, first, pinhole(view),
-        {"loss_type": "CAUCHY", "loss_scale": scale_px},
+        {"loss_type": "CAUCHY", "loss_scale": scale_px, "max_iterations": FIT_ITERATIONS},
     )  # fmt: skip
     pose = np.eye(4)
     pose[:3] = fitted.Rt
@@ -174,18 +176,31 @@ def project_all(view: View, keyframes: Sequence[KeyframeView], pose: FloatArray)
     return found
 
 
-def step_between(before: KeyframeView, view: View, expected: FloatArray, options: PlacingOptions) -> Step | None:
+def step_between(
+    before: KeyframeView, view: View, expected: FloatArray, options: PlacingOptions, *, steady: bool = True
+) -> Step | None:
     """The motion from the image `before`, whose world is its own camera, to `view`; `expected` ``[4, 4]`` is a guess.
 
-    Pairs are looked for where the guess puts them, then everywhere. None where too few agree.
+    Pairs are looked for where the guess puts them, then everywhere; where the camera is not `steady`, so that guesses
+    are wrong anyway, the other way round. None where too few agree.
     """
-    pairs = guided_pairs(
-        view, [before], project_all(view, [before], expected), replace(options.pose.matching, guided_radius_px=40.0)
-    )
-    found = _step(before, view, pairs, options, expected)
-    if found is not None:
-        return found
-    return _step(before, view, _all_pairs(before, view, options), options)
+
+    def guided() -> Step | None:
+        near = replace(options.pose.matching, guided_radius_px=STEP_RADIUS_PX)
+        pairs = guided_pairs(view, [before], project_all(view, [before], expected), near)
+        return _step(before, view, pairs, options, expected)
+
+    def anywhere() -> Step | None:
+        return _step(before, view, _all_pairs(before, view, options), options)
+
+    first, second = (guided, anywhere) if steady else (anywhere, guided)
+    return first() or second()
+
+
+def is_steady(view: View, expected: FloatArray, found: FloatArray) -> bool:
+    """Whether a step ``[4, 4]`` was one that `expected` lets pairs of it be found."""
+    turn = so3_log(expected[:3, :3].T @ found[:3, :3])
+    return float(np.linalg.norm(turn)) * view.focal < STEP_RADIUS_PX / 2
 
 
 def _all_pairs(before: KeyframeView, view: View, options: PlacingOptions) -> Pairs:

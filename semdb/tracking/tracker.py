@@ -14,7 +14,15 @@ from semdb.geometry import invert_pose, pose_error, pose_from, so3_exp, so3_log,
 from semdb.localization.confidence import sigmas
 from semdb.localization.views import KeyframeView, View, in_kind_of
 from semdb.tracking.options import MotionOptions, TrackerOptions
-from semdb.tracking.placing import Placed, convinces, place_anywhere_near, place_near, search_radius_px, step_between
+from semdb.tracking.placing import (
+    Placed,
+    convinces,
+    is_steady,
+    place_anywhere_near,
+    place_near,
+    search_radius_px,
+    step_between,
+)
 from semdb.tracking.pose_filter import FilterState, Step, begin, measured, moved, surprise, transition_of
 from semdb.tracking.smoothing import Passage
 from semdb.tracking.states import TrackedPose, TrackSource, TrackState
@@ -60,6 +68,7 @@ class Tracker:
         self._time_s = -np.inf  # of the last frame
         self._seen_s = -np.inf  # of the last one that was placed in the map
         self._before: KeyframeView | None = None  # the last frame with points, in its own camera
+        self._steady = True  # it goes on as it went, as far as the last two images show
         self._odometry: FloatArray | None = None  # at the last frame
         self._waiting: list[_Fix] = []
         self._map_from_odom: FloatArray | None = None
@@ -107,8 +116,10 @@ class Tracker:
         else:
             step = predicted_step(self._velocity, gap_s, self._unseen_s, options)
         if self._before is not None and self.options.step:
-            seen = step_between(self._before, view, step.before_from_after, self.options.placing)
+            expected = step.before_from_after
+            seen = step_between(self._before, view, expected, self.options.placing, steady=self._steady)
             if seen is not None:
+                self._steady = is_steady(view, expected, seen.before_from_after)
                 return Step(seen.before_from_after, seen_noise(seen, options, self._unrest)), TrackSource.ODOMETRY
         return step, source
 

@@ -53,9 +53,11 @@ def walked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
 
 
-@pytest.fixture(scope="module")
-def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> list[Frame]:
-    options = SyntheticOptions(frames=6, width=320, height=240, lap_frames=160, room_seed=5)
+@pytest.fixture(
+    scope="module", params=[{"room_seed": 5}, {"alike": True, "seed": 60}], ids=["another room", "one that looks alike"]
+)
+def elsewhere(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> list[Frame]:
+    options = SyntheticOptions(frames=6, width=320, height=240, lap_frames=160, **request.param)
     return list(open_recording(render(tmp_path_factory.mktemp("other") / "other", options)).frames())
 
 
@@ -128,6 +130,15 @@ def test_in_the_dark_it_coasts_and_says_how_unsure_it_is(database: Database, fra
     for answer, frame in zip(answers[15:21], frames[15:21], strict=True):
         assert error(answer, frame)[0] < 3 * answer.sigma_m
         assert "no keyframe" in answer.reason
+
+
+def test_frames_of_a_fifth_of_the_light_are_tracked(database: Database, frames: list[Frame]) -> None:
+    tracker, noise = database.tracker("room"), np.random.default_rng(0)
+    for number, frame in enumerate(frames[:8]):
+        dim = 51 * (frame.image / 255.0) ** 1.5 + noise.normal(0, 1.5, frame.image.shape)
+        image = np.clip(dim, 0, 255).astype(np.uint8) if number >= 3 else frame.image
+        answer = tracker.update(replace(frame, image=image))
+        assert (str(answer.state), number, error(answer, frame)[0] < 0.03) == ("tracking", number, True)
 
 
 def test_odometry_carries_through_the_dark_and_is_corrected(database: Database, frames: list[Frame]) -> None:
