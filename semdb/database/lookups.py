@@ -10,6 +10,7 @@ from sqlalchemy.sql.elements import ColumnElement
 
 from semdb.database import checked, retry
 from semdb.database.planning import ROLES, model_of
+from semdb.database.pose_errors import measured_states
 from semdb.database.reading import depth_scale_of
 from semdb.database.records import MapHead, UsedCamera
 from semdb.database.tables import (
@@ -31,7 +32,7 @@ from semdb.types import Camera, ModelInfo
 
 
 def map_heads(engine: Engine) -> list[MapHead]:
-    """All maps by id, with what a query must be made with: three small queries, whatever the maps hold.
+    """All maps by id, with what a query must be made with: four small queries, whatever the maps hold.
 
     A map whose rows are damaged says so itself, since the others can be used.
     """
@@ -54,13 +55,15 @@ def map_heads(engine: Engine) -> list[MapHead]:
         refined: dict[int, list[str]] = {}
         for map_id, *step in connection.execute(steps):
             refined.setdefault(map_id, []).append(" ".join(map(str, step)))
+        measured = measured_states(connection)
         found = []
         for key, name, there in connection.execute(heads):
             made = tuple(infos.get(key, ()))
             missing = [role for role in ROLES if there and all(info.role != role for info in made)]
             lacks = f"map_models of map {key} name no {' and no '.join(missing)}" if missing else ""
             known = checked.text(name, f"maps.name of map {key}")
-            found.append(MapHead(key, known, made, tuple(refined.get(key, ())), bool(there), damage.get(key, lacks)))
+            steps_of, wrong = tuple(refined.get(key, ())), damage.get(key, lacks)
+            found.append(MapHead(key, known, made, steps_of, bool(there), wrong, measured.get(key, "")))
         return found
 
     return retry.read(engine, work)

@@ -5,17 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from sqlalchemy import Connection, Engine, delete, func, insert, select, update
+from sqlalchemy import BigInteger, Connection, Engine, cast, delete, func, insert, select, update
 from sqlalchemy.exc import IntegrityError
 
 from semdb.database import checked, retry
+from semdb.database.exact_sums import exact_sum
 from semdb.database.reading import Bad
+from semdb.database.refinements import MICRO, within
 from semdb.database.tables import keyframes, pose_errors, recordings
 from semdb.errors import CodecError
 from semdb.types import PoseErrors
 
 POSE_ERRORS = "errors"  # the step of `semdb refine`
 NUMBERS = ("position_m", "position_freedom", "rotation_rad", "rotation_freedom")
+NANO = 1_000_000_000
 
 
 def replace_pose_errors(connection: Connection, map_id: int, found: Mapping[int, PoseErrors]) -> int:
@@ -67,6 +70,20 @@ def load_pose_errors(engine: Engine, map_id: int, bad: Bad | None = None) -> dic
                 raise
             bad(row.recording_id, error)
     return found
+
+
+def measured_states(connection: Connection) -> dict[int, str]:
+    """What is measured of each map's recordings, in a line: equal lines, the same numbers of as many recordings.
+
+    Maps of which nothing is measured are left out.
+    """
+    e = pose_errors.c
+    mixed = within(e.position_m) + 3 * within(e.rotation_rad)  # a thousandth of a micrometre shows
+    sums = exact_sum(connection.engine, cast(func.round(mixed * NANO), BigInteger))
+    numbers = exact_sum(connection.engine, cast(func.round(within(e.position_freedom) * MICRO), BigInteger))
+    query = select(recordings.c.map_id, func.count(), *sums, *numbers)
+    query = query.select_from(pose_errors.join(recordings)).group_by(recordings.c.map_id)
+    return {map_id: " ".join(map(str, line)) for map_id, *line in connection.execute(query)}
 
 
 def map_of(engine: Engine, recording_id: int) -> int | None:

@@ -65,7 +65,8 @@ class ImageKind:
 class MapHead:
     """What a program that keeps a map in memory looks at before each query: equal heads, the same models and steps.
 
-    What happens to the keyframes is not in it; `refined` has a line for each step of `semdb refine` that was run.
+    What happens to the keyframes is not in it; `refined` has a line for each step of `semdb refine` that was run,
+    `measured` one of how far the poses of its recordings are off, which ingest measures after the last keyframe.
     """
 
     id: int
@@ -74,6 +75,7 @@ class MapHead:
     refined: tuple[str, ...]
     holds_keyframes: bool = field(compare=False)
     damage: str = ""  # why the map cannot be asked, where its rows are damaged
+    measured: str = ""
 
 
 @dataclass(frozen=True, slots=True)

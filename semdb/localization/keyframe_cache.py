@@ -88,6 +88,11 @@ class KeyframeCache:
         with self._turn:
             self._forget(change)
 
+    def measured_anew(self) -> None:
+        """How far recorded poses are off is read again when it is next asked for."""
+        with self._turn:
+            self._pose_errors = None
+
     def _forget(self, change: MapChange) -> None:
         if self._refined:
             if self._points == USED:
@@ -255,13 +260,23 @@ class KeyframeCache:
         return self._names.get(keyframe_id, ("", -1))
 
     def near(
-        self, pose: FloatArray, limit: float, without: Collection[int], count: int | None = None
+        self,
+        pose: FloatArray,
+        limit: float,
+        without: Collection[int],
+        count: int | None = None,
+        among: Sequence[int] | None = None,
     ) -> tuple[list[int], FloatArray]:
         """Ids and poses ``[n, 4, 4]`` of the `count` keyframes nearest to `pose`, nearest first, but for `without`.
 
-        They are less than `limit` away (`pose_distances`).
+        They are less than `limit` away (`pose_distances`); those equally far in the order of `among`, which may be
+        some of the map's, or of their ids.
         """
         ids, poses = self.poses()
+        if among is not None:
+            place = {key: n for n, key in enumerate(ids)}
+            ids = [key for key in among if key in place]
+            poses = poses[[place[key] for key in ids]]
         # the distance is at least that of the positions alone: turns are worked out for few
         close = np.flatnonzero(((poses[:, :3, 3] - pose[:3, 3]) ** 2).sum(axis=1) < (limit * POSE_UNIT_M) ** 2)
         distance = pose_distances(pose, poses[close])

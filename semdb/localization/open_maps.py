@@ -131,6 +131,9 @@ class OpenMaps:
             return known
         with self._opening:
             known = self._open.get((head.id, coarse))  # another thread may have opened it meanwhile
+            if known is not None and known.head != head == replace(known.head, measured=head.measured):
+                known.localizer.cache.measured_anew()  # nothing else of the map is another
+                known = self._open[head.id, coarse] = replace(known, head=head)
             if known is None or known.head != head:
                 known = OpenMap(head, self._describer(head), self._localizer(head, coarse))
                 self._open[head.id, coarse] = known

@@ -106,7 +106,8 @@ def errors_of(
     from semdb.localization.keyframe_cache import KeyframeCache
     from semdb.localization.recorded_errors import pooled
 
-    cache, told = KeyframeCache(store, map_id), []
+    # by measured points, refined or not: the numbers are of the recording, whatever steps were run before
+    cache, told = KeyframeCache(store, map_id, refined=False), []
     for count, keyframe_id in enumerate(spread_over(ids, options.most), start=1):
         one = errors_at(cache, store, map_id, keyframe_id, ids, options)
         told += [one] if one is not None else []
@@ -122,23 +123,17 @@ def errors_at(
 
     Raises CodecError where models of the map are damaged.
     """
-    from semdb.geometry import pose_distances
     from semdb.localization.localizer import LocalizerOptions
     from semdb.localization.pose import estimate_pose, first_pose, match_views
     from semdb.localization.verdict import convinces
 
     known, poses = cache.poses()
-    place = {key: n for n, key in enumerate(known)}
-    if keyframe_id not in place:
+    if keyframe_id not in known:
         return None
-    others = [key for key in ids if key != keyframe_id and key in place]
-    if not others:
-        return None
-    distance = pose_distances(poses[place[keyframe_id]], poses[[place[key] for key in others]])
-    order = [int(n) for n in np.argsort(distance, kind="stable") if distance[n] < options.farthest]
-    own = cache.views([keyframe_id])
-    near = cache.views([others[n] for n in order[: options.neighbours]])
-    if not own:
+    place = poses[known.index(keyframe_id)]
+    others, _ = cache.near(place, options.farthest, (keyframe_id,), options.neighbours, ids)
+    own, near = cache.views([keyframe_id]), cache.views(others)
+    if not own or not near:
         return None
     width = own[0].view.descriptors.shape[1]  # rows of another one are damaged: the step of points says which
     keyframes = [keyframe for keyframe in near if keyframe.view.descriptors.shape[1] == width]

@@ -24,8 +24,10 @@ from semdb.localization.coarse import MapChange
 from semdb.localization.images import make_localizer
 from semdb.localization.keyframe_cache import KeyframeCache
 from semdb.localization.localizer import LocalizerOptions
+from semdb.localization.open_maps import OpenMaps
 from semdb.refinement import error_step
 from semdb.refinement.run import refine_map
+from semdb.settings import Settings
 from semdb.types import Description, FloatArray, Keypoints, PoseErrors
 from tests.database_samples import MODELS, description, plan, record
 from tests.unit.localization_scene import CAMERA, Scene
@@ -210,6 +212,48 @@ def test_an_open_map_takes_errors_that_are_measured_later(
     assert [view.pose_errors for view in cache.views(ids)] == [None, None]
     cache.forget(MapChange(added=frozenset([ids[-1] + 1])))
     assert [view.pose_errors for view in cache.views(ids)] == [errors, errors]
+
+
+def test_a_map_that_is_open_to_queries_takes_errors_once_they_are_measured(
+    store: Store, views: tuple[list[KeyframeRecord], ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    info, recording_id = ingest(store, "room", views[0], range(2))
+    monkeypatch.setattr(OpenMaps, "_describer", lambda *_: None)
+    maps, (ids, _) = OpenMaps(store, Settings()), store.poses(info.id)
+    (first,) = maps.asked("room", "sql")
+    before = first.localizer.cache.views(ids)
+    assert [view.pose_errors for view in before] == [None, None]
+    for errors in (PoseErrors(0.01, 0.005, 90.0, 60.0, 12), PoseErrors(0.01, 0.005000001, 90.0, 60.0, 12)):
+        write_pose_errors(store.engine, recording_id, errors)  # no keyframe has changed
+        (asked,) = maps.asked("room", "sql")
+        assert asked.localizer is first.localizer  # and the rest stays in memory
+        after = asked.localizer.cache.views(ids)
+        assert [view.pose_errors for view in after] == [errors, errors]
+        assert after[0].view is before[0].view
+        assert maps.asked("room", "sql") == [asked]
+
+
+def test_errors_of_recorded_poses_do_not_depend_on_other_steps(
+    store: Store, views: tuple[list[KeyframeRecord], ...]
+) -> None:
+    found = []
+    for name, kinds in (("first", [POSE_ERRORS]), ("last", [POINTS, POSE_ERRORS])):
+        info, recording_id = ingest(store, name, views[0], range(FRAMES))
+        refine_map(store, info, kinds=kinds)
+        found.append(load_pose_errors(store.engine, info.id)[recording_id])
+    assert found[0] == found[1]
+
+
+def test_keyframes_equally_near_come_in_the_order_asked_for(
+    store: Store, views: tuple[list[KeyframeRecord], ...]
+) -> None:
+    records = [replace(one, world_from_camera=pose_of(0)) for one in views[0]]
+    info, _ = ingest(store, "room", records, range(FRAMES))
+    cache, (ids, _) = KeyframeCache(store, info.id), store.poses(info.id)
+    assert cache.near(pose_of(0), 1.0, ids[:2])[0] == ids[2:]
+    found, poses = cache.near(pose_of(0), 1.0, (ids[1],), 3, [ids[4], ids[1], ids[-1] + 1, ids[0], ids[3], ids[2]])
+    assert found == [ids[4], ids[0], ids[3]]
+    assert poses.shape == (3, 4, 4)
 
 
 def test_few_or_damaged_keyframes_are_not_measured_at_ingest(
