@@ -243,7 +243,8 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class PoseErrors:
-    """How far the poses of a recording are off the images of its keyframes, along an axis.
+    """How far the poses of a recording are off the images of its keyframes: standard deviations along an axis, of a
+    pose at a distance (`pose_distances`) of 1 from them.
 
     The freedoms are how many numbers of keyframes' poses told: 0, nothing is known.
     """

@@ -222,7 +222,7 @@ def estimate_with(
         together, _ = fused(laid.world_from_camera, laid.covariance, found.world_from_camera, found.covariance)
         own, others = laid.covariance - _shared(), FEW_KEYPOINTS * found.covariance
         covariance = np.linalg.inv(np.linalg.inv(own) + np.linalg.inv(others)) + _shared()  # not seen by either
-        return replace(found, world_from_camera=together, covariance=covariance, recorded_sigma=(0.0, 0.0))
+        return replace(found, world_from_camera=together, covariance=covariance, recorded=None)
     agreeing = pairs.take(near)
     return PoseEstimate(
         world_from_camera=laid.world_from_camera,

@@ -18,15 +18,15 @@ from semdb.localization.adjustment import (
     projected_error_px,
 )
 from semdb.localization.alignment import Alignment, align_pairs
-from semdb.localization.bundle import QUERY, BundleResult
+from semdb.localization.bundle import BundleResult
 from semdb.localization.learned_matching import KeypointMatcher, match_by
 from semdb.localization.matching import Matches, MatchingOptions, match_keypoints
 from semdb.localization.pairs import Pairs, guided_pairs, join_pairs, reprojection_px, world_points_of
 from semdb.localization.pose_options import PoseOptions
-from semdb.localization.recorded_errors import at_query, recorded_sigma, shrunk, weighted
+from semdb.localization.recorded_errors import AtQuery, at_query, recorded_errors, shrunk, weighted
 from semdb.localization.views import KeyframeView, View
 from semdb.threads import each
-from semdb.types import BoolArray, ConsistentPose, FloatArray, IntArray, PoseErrors
+from semdb.types import BoolArray, ConsistentPose, FloatArray, IntArray
 
 MINIMUM_PAIRS = 6  # below, a pose from 3 points has nothing to be checked with
 RIVAL_SHARE = 0.2  # of the first inliers with the best keyframe: a rival with fewer says nothing and may be missed
@@ -88,8 +88,8 @@ class PoseEstimate:
     residual_px: float  # median reprojection error of the inliers
     spread: float  # 0..1: share of a 4x4 grid over the image that holds inliers
     aligned: int = 0  # pairs whose patches are alike to a fraction of a pixel; 0 without images
-    recorded_sigma: tuple[float, float] = (0.0, 0.0)  # m and rad that poses recorded here are off, beyond `covariance`
-    evident: PoseErrors | None = None  # what this query shows of how far the poses of keyframes are off
+    recorded: FloatArray | None = None  # [6, 6] of how far poses recorded here are off, beyond `covariance`
+    at: AtQuery | None = None  # where these errors meet the query
     seen: Alignment | None = None  # where the query shows `pairs`, to a fraction of a pixel where patches were aligned
 
 
@@ -209,26 +209,18 @@ def estimate_pose(
     keep = error < options.inlier_px
     aligned = int(np.count_nonzero(seen.found))
     alignment = Alignment(seen.xy[keep], seen.found[keep])
-    found = replace(estimate, aligned=aligned, evident=refined.evident, seen=alignment)
-    return replace(found, recorded_sigma=_recorded_sigma(found, keyframes, refined))
-
-
-def _recorded_sigma(
-    estimate: PoseEstimate, keyframes: Sequence[KeyframeView], refined: BundleResult
-) -> tuple[float, float]:
-    """See `recorded_errors`: by what this query shows, what its keyframes' recordings do, and what is usual."""
-    if refined.evident is None or estimate.covariance is None:
-        return 0.0, 0.0
-    known = weighted([keyframe.pose_errors for keyframe in keyframes], estimate.per_keyframe)
-    query = at_query(estimate.covariance, refined.nearest, refined.turn[QUERY])
-    return recorded_sigma(shrunk(refined.evident, known), query)
+    at = at_query(refined.nearest, refined.turn, estimate.per_keyframe, estimate.world_from_camera)
+    found = replace(estimate, aligned=aligned, at=at, seen=alignment)
+    # by what this query shows, what its keyframes' recordings do, and what is usual
+    measured = weighted([keyframe.pose_errors for keyframe in keyframes], estimate.per_keyframe)
+    return replace(found, recorded=recorded_errors(shrunk(refined.evident, measured), at))
 
 
 def recorded_covariance(estimate: PoseEstimate) -> FloatArray | None:
     """``[6, 6]`` of the pose in the frame of the recorded poses: what images leave open, and how far these are off."""
-    if estimate.covariance is None:
-        return None
-    return estimate.covariance + np.diag(np.repeat(estimate.recorded_sigma, 3) ** 2)
+    if estimate.covariance is None or estimate.recorded is None:
+        return estimate.covariance
+    return estimate.covariance + estimate.recorded
 
 
 def _joined_pose(

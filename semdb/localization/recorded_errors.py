@@ -1,8 +1,8 @@
 """How far recorded poses are off what images show, and what of it an answer must count with.
 
 The true poses of a recording, and so the frame of its map, have errors of their own: a depth tracker drifts, motion
-capture has another clock. How much, the images of the keyframes show: each localized among its neighbours says by how
-much these are off (`bundle`), and all of a recording together say it better than one query can.
+capture has another clock. How much, its keyframes show: each is localized among its neighbours as a query would be, and
+its recorded pose is known (leave-one-out cross-validation). What its images leave open is taken off.
 """
 
 from __future__ import annotations
@@ -14,66 +14,107 @@ import numpy as np
 
 from semdb.types import FloatArray, PoseErrors
 
-USUAL = PoseErrors(0.007, 0.006, 8.0, 8.0)  # of a recording of which nothing is known, as good as so many numbers
 PLACE, TURN = slice(0, 3), slice(3, 6)
 LEAST_M, LEAST_RAD = 1e-5, 1e-5  # below, it is nothing
-OWN_SHARE = 0.5  # of what a query itself shows, beside what its keyframes' recordings do: few keyframes err alike
+ROUNDS = 60  # of the fit
+USUAL = PoseErrors(0.006, 0.006, 3.0, 6.0)  # of a recording of which nothing is known, as good as so many numbers
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorModel:
-    """What errors of recorded poses make of an answer; fitted on the recordings of docs/localization.md.
+    """What errors of recorded poses make of an answer; docs/localization.md says what was fitted on what.
 
-    A place is off by `place` metres at 1 of `pose_distances` from the nearest keyframe where the recording's errors are
-    `unit_m` and images alone leave `unit_image_m`; it grows with powers of all three, and `near` is not fallen below.
-    A turn likewise, in shares of the recording's own. `clock` is what the turn during a readout adds, where clocks of
-    poses and images differ: metres and radians for a radian.
+    A place is off in proportion to a power of the distance (`pose_distances`) of the nearest keyframe, not less than at
+    `place_near`, and to a power of how much one keyframe is `alone`: what several have wrong cancels in part. A turn
+    is off likewise, but for that. Besides it is off by the share `clock` of the difference between the turns of query
+    and keyframes during the readout, since the clock of the poses is not that of the images.
     """
 
-    unit_m: float = 0.008
-    greatest_m: float = 0.016  # beyond, a place is off in proportion: recordings that it was fitted on have less
-    unit_image_m: float = 0.008
-    place: float = 0.0066
-    place_errors: float = 3.0
-    place_image: float = 0.87
-    place_distance: float = 0.6
-    place_near: float = 0.22
-    unit_image_rad: float = 0.004
-    turn: float = 1.5
-    turn_image: float = 0.8
-    turn_distance: float = 0.71
-    turn_near: float = 0.02
-    clock_m: float = 0.038
-    clock_rad: float = 0.16
-    clock_of_m: float = 0.004  # of the recording's errors, from which on its clock is believed to differ
-    clock_of_rad: float = 0.003
+    place_power: float = 1.05
+    place_near: float = 0.15
+    alone_power: float = 0.25
+    turn_power: float = 1.1
+    turn_near: float = 0.25
+    clock: float = 0.33
+    tail: float = 5.0  # degrees of freedom of Student's t that errors of keyframes are taken to have: some are far off
+    alike: float = 0.5  # of the numbers of keyframes count: neighbours err alike
+    usual: PoseErrors = USUAL
+    own: float = 0.25  # of what a query itself shows counts
 
 
-@dataclass(frozen=True, slots=True)
+MODEL = ErrorModel()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class AtQuery:
-    """What the errors of recorded poses count by at one query. Standard deviations are along an axis."""
+    """Where errors of recorded poses meet a query: distances of the nearest keyframe (`pose_distances`), for its place
+    and its turn, by how much more than its keyframes it turned during the readout, ``[3]`` rad in the world, and the
+    sum of squares of the keyframes' shares of the pairs (1: all are of one).
+    """
 
-    nearest: tuple[float, float]  # distances of the nearest keyframe (`pose_distances`) for its place and its turn
-    position_m: float  # standard deviation that images alone leave
-    rotation_rad: float
-    turn_rad: float  # by which the camera turned while the image was read out
-
-
-def pooled(found: Sequence[PoseErrors]) -> PoseErrors:
-    """What several say together: the mean of squares, each as often as it has numbers. Nothing known of none."""
-    place = np.array([[one.position_freedom, one.position_m**2] for one in found]).reshape(-1, 2)
-    turn = np.array([[one.rotation_freedom, one.rotation_rad**2] for one in found]).reshape(-1, 2)
-    metres, radians = (float(np.sqrt((of[:, 0] * of[:, 1]).sum() / max(of[:, 0].sum(), 1e-9))) for of in (place, turn))
-    return PoseErrors(metres, radians, float(place[:, 0].sum()), float(turn[:, 0].sum()), len(found))
+    nearest: tuple[float, float]
+    turn: FloatArray
+    alone: float
 
 
-def shrunk(own: PoseErrors | None, known: Sequence[PoseErrors]) -> PoseErrors:
+@dataclass(frozen=True, slots=True, eq=False)
+class LeftOut:
+    """A keyframe localized among others: its `error` ``[6]`` (m, rad; world) against its recorded pose, and the
+    `covariance` ``[6, 6]`` of what images leave open.
+    """
+
+    error: FloatArray
+    covariance: FloatArray
+    at: AtQuery
+
+
+def measured(found: Sequence[LeftOut], model: ErrorModel = MODEL) -> PoseErrors:
+    """How far the poses of a recording are off at a distance of 1, by its keyframes; nothing known of none."""
+    metres, radians = (_spread(found, part, model) for part in (PLACE, TURN))
+    numbers = 3.0 * len(found) * model.alike
+    return PoseErrors(metres, radians, numbers, numbers, len(found))
+
+
+def _spread(found: Sequence[LeftOut], part: slice, model: ErrorModel) -> float:
+    """Standard deviation along an axis at a distance of 1: maximum likelihood, errors being Student's t.
+
+    Fixed-point iteration on the equation of the likelihood (each error weighs less the farther off it is).
+    """
+    if not found:
+        return 0.0
+    errors = np.array([one.error[part] for one in found])
+    fixed = np.array([one.covariance[part, part] + _of_clock(one.at, part, model) for one in found])
+    grows = np.array([_growth(one.at, part, model) ** 2 for one in found])
+    variance = float((errors**2).mean())
+    for _ in range(ROUNDS):
+        inverse = np.linalg.inv(fixed + variance * grows[:, None, None] * np.eye(3))
+        scaled = np.einsum("nij,nj->ni", inverse, errors)
+        weight = (model.tail + 3) / (model.tail + (scaled * errors).sum(axis=1))
+        seen, expected = (weight * grows * (scaled**2).sum(axis=1)).sum(), (grows * np.trace(inverse, 0, 1, 2)).sum()
+        variance = max(variance * float(seen / expected), 1e-14)
+    return float(np.sqrt(variance * model.tail / (model.tail - 2)))
+
+
+def _growth(at: AtQuery, part: slice, model: ErrorModel) -> float:
+    """How many times as far as at a distance of 1 it is off."""
+    if part == TURN:
+        return float(np.hypot(at.nearest[1], model.turn_near) ** model.turn_power)
+    return float(np.hypot(at.nearest[0], model.place_near) ** model.place_power * at.alone**model.alone_power)
+
+
+def _of_clock(at: AtQuery, part: slice, model: ErrorModel) -> FloatArray:
+    """Covariance ``[3, 3]`` of what another clock makes of a turning camera."""
+    off = model.clock * at.turn if part == TURN else np.zeros(3)
+    return np.outer(off, off)
+
+
+def shrunk(own: PoseErrors | None, known: Sequence[PoseErrors], model: ErrorModel = MODEL) -> PoseErrors:
     """The weighted mean of logarithms of what a query itself shows, of what is known, and of what is usual.
 
     Of logarithms, since errors of recordings differ by factors.
     """
-    less = [] if own is None else [_scaled(own, OWN_SHARE)]
-    of = (USUAL, *less, *known)
+    less = [] if own is None else [_scaled(own, model.own)]
+    of = (model.usual, *less, *known)
     place, turn = np.array([one.position_freedom for one in of]), np.array([one.rotation_freedom for one in of])
     metres = np.log([max(one.position_m, LEAST_M) for one in of])
     radians = np.log([max(one.rotation_rad, LEAST_RAD) for one in of])
@@ -99,20 +140,20 @@ def _scaled(one: PoseErrors, share: float) -> PoseErrors:
     return PoseErrors(one.position_m, one.rotation_rad, one.position_freedom * share, one.rotation_freedom * share)
 
 
-def recorded_sigma(errors: PoseErrors, query: AtQuery, model: ErrorModel | None = None) -> tuple[float, float]:
-    """How far (m, rad; along an axis) a pose recorded where the query is would be off what the images show."""
-    of = model or ErrorModel()
-    place = np.hypot(query.nearest[0] ** of.place_distance, of.place_near) * of.place
-    place *= (min(errors.position_m, of.greatest_m) / of.unit_m) ** of.place_errors
-    place *= max(errors.position_m / of.greatest_m, 1.0) * (query.position_m / of.unit_image_m) ** of.place_image
-    turn = np.hypot(query.nearest[1] ** of.turn_distance, of.turn_near) * of.turn * errors.rotation_rad
-    turn *= (query.rotation_rad / of.unit_image_rad) ** of.turn_image
-    metres = of.clock_m * query.turn_rad * min(errors.position_m / of.clock_of_m, 1.0) ** 2
-    radians = of.clock_rad * query.turn_rad * min(errors.rotation_rad / of.clock_of_rad, 1.0) ** 2
-    return float(np.hypot(place, metres)), float(np.hypot(turn, radians))
+def recorded_errors(errors: PoseErrors, at: AtQuery, model: ErrorModel = MODEL) -> FloatArray:
+    """Covariance ``[6, 6]`` of how far a pose recorded where the query is would be off what the images show."""
+    found = np.zeros((6, 6))
+    for part, of in ((PLACE, errors.position_m), (TURN, errors.rotation_rad)):
+        found[part, part] = (of * _growth(at, part, model)) ** 2 * np.eye(3) + _of_clock(at, part, model)
+    return found
 
 
-def at_query(covariance: FloatArray, nearest: tuple[float, float], turn: FloatArray) -> AtQuery:
-    """Of a pose with the `covariance` ``[6, 6]`` that images alone leave, and `turn` ``[3]`` (rad) in its readout."""
-    place, rotation = (float(np.sqrt(max(np.trace(covariance[of, of]) / 3, 0.0))) for of in (PLACE, TURN))
-    return AtQuery(nearest, place, rotation, float(np.linalg.norm(turn)))
+def at_query(
+    nearest: tuple[float, float], turns: FloatArray, pairs: Sequence[int], world_from_camera: FloatArray
+) -> AtQuery:
+    """Of a pose ``[4, 4]``: `turns` ``[c, 3]`` (rad) are those of the images in their own frames, the query first;
+    `pairs` with each of the ``c - 1`` keyframes.
+    """
+    shares = np.maximum(pairs, 1e-3) / np.maximum(pairs, 1e-3).sum()
+    more: FloatArray = world_from_camera[:3, :3] @ (turns[0] - shares @ turns[1:])
+    return AtQuery(nearest, more, float(shares @ shares))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, astuple, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,9 +23,10 @@ from semdb.types import PoseErrors
 
 if TYPE_CHECKING:
     from semdb.localization.keyframe_cache import KeyframeCache
+    from semdb.localization.recorded_errors import LeftOut
 
-REVISION = 1  # of the computation: another one makes what is stored out of date
-FIRST_LEAST, FIRST_MOST = 8, 12  # keyframes that are measured when a recording of so many at least is ingested
+REVISION = 2  # of the computation: another one makes what is stored out of date
+FIRST_LEAST, FIRST_MOST = 8, 16  # keyframes that are measured when a recording of so many at least is ingested
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +105,7 @@ def errors_of(
     Raises NotFoundError where a keyframe is deleted meanwhile, CodecError.
     """
     from semdb.localization.keyframe_cache import KeyframeCache
-    from semdb.localization.recorded_errors import pooled
+    from semdb.localization.recorded_errors import measured
 
     # by measured points, refined or not: the numbers are of the recording, whatever steps were run before
     cache, told = KeyframeCache(store, map_id, refined=False), []
@@ -113,19 +114,18 @@ def errors_of(
         told += [one] if one is not None else []
         if progress is not None:
             progress(count)
-    return pooled(told) if told else None
+    return measured(told) if told else None
 
 
 def errors_at(
     cache: KeyframeCache, store: Store, map_id: int, keyframe_id: int, ids: Sequence[int], options: ErrorOptions
-) -> PoseErrors | None:
-    """What one keyframe, localized among those of `ids` that are nearest, shows; None where it is not localized.
+) -> LeftOut | None:
+    """One keyframe localized among those of `ids` that are nearest; None where it is not.
 
     Raises CodecError where models of the map are damaged.
     """
+    from semdb.localization.cross_validation import localized_among
     from semdb.localization.localizer import LocalizerOptions
-    from semdb.localization.pose import estimate_pose, first_pose, match_views
-    from semdb.localization.verdict import convinces
 
     known, poses = cache.poses()
     if keyframe_id not in known:
@@ -139,16 +139,7 @@ def errors_at(
     keyframes = [keyframe for keyframe in near if keyframe.view.descriptors.shape[1] == width]
     if not keyframes:
         return None
-    settings = LocalizerOptions().for_models(store.map_models(map_id))
-    pose = replace(settings.pose, use_query_depth=False)
-    matches = match_views(own[0].view, keyframes, pose)
-    first = first_pose(own[0].view, keyframes, matches, pose)
-    if first is None or not convinces(first, settings.verdict):
-        return None
-    estimate = estimate_pose(own[0].view, keyframes, matches, pose, first)
-    found = None if estimate is None else estimate.evident
-    # damaged points may be anywhere: what is no number, no database takes
-    return found if found is not None and np.isfinite(astuple(found)).all() else None
+    return localized_among(own[0], keyframes, LocalizerOptions().for_models(store.map_models(map_id)))
 
 
 def spread_over(ids: Sequence[int], most: int) -> list[int]:

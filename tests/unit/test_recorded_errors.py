@@ -1,36 +1,87 @@
-"""What several keyframes say of how far recorded poses are off, and what of it an answer counts with."""
+"""What keyframes that are left out say of how far recorded poses are off, and what of it an answer counts with."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from semdb.geometry import pose_distances, pose_from, pose_offset, so3_exp
+from semdb.localization.cross_validation import localized_among
+from semdb.localization.localizer import LocalizerOptions
+from semdb.localization.pose import estimate_pose, match_views, recorded_covariance
 from semdb.localization.recorded_errors import (
+    MODEL,
     USUAL,
     AtQuery,
+    LeftOut,
     at_query,
-    pooled,
-    recorded_sigma,
+    measured,
+    recorded_errors,
     shrunk,
     weighted,
 )
-from semdb.types import PoseErrors
+from semdb.localization.views import ClassNumbers, KeyframeView, make_keyframe_view
+from semdb.types import FloatArray, PoseErrors
+from tests.unit.localization_scene import CAMERA, Scene
 
-QUERY = AtQuery(nearest=(0.8, 0.8), position_m=0.005, rotation_rad=0.002, turn_rad=0.01)
+STILL = np.zeros(3)
+FRAMES = 40
 
 
-def test_keyframes_count_by_how_many_numbers_they_determine() -> None:
-    found = pooled([PoseErrors(0.003, 0.002, 1.0, 8.0), PoseErrors(0.009, 0.006, 3.0, 0.0)])
-    assert found.position_m == pytest.approx(np.sqrt((0.003**2 + 3 * 0.009**2) / 4))
-    assert found.rotation_rad == pytest.approx(0.002)
-    assert (found.position_freedom, found.rotation_freedom, found.keyframes) == (4.0, 8.0, 2)
-    assert pooled([]) == PoseErrors(0.0, 0.0, 0.0, 0.0, 0)
+def times(distance: float) -> np.ndarray:
+    """As many times as at a distance of 1 poses are off where two keyframes have the same share."""
+    place = np.hypot(distance, MODEL.place_near) ** MODEL.place_power * 0.5**MODEL.alone_power
+    return np.repeat([place, np.hypot(distance, MODEL.turn_near) ** MODEL.turn_power], 3)
+
+
+def left_out(metres: float, degrees: float, count: int, *, image_m: float = 0.004, seed: int = 0) -> list[LeftOut]:
+    """Keyframes of a recording whose poses are off by so much at a distance of 1, one in ten by five times as much."""
+    random, found = np.random.default_rng(seed), []
+    covariance = np.diag(np.repeat([image_m, 0.001], 3) ** 2)
+    for number in range(count):
+        distance = float(random.uniform(0.5, 2.5))
+        off = np.repeat([metres, np.radians(degrees)], 3) * times(distance)
+        error = random.normal(size=6) * np.hypot(off * (5 if number % 10 == 9 else 1), np.sqrt(np.diag(covariance)))
+        found.append(LeftOut(error, covariance, AtQuery((distance, distance), STILL, 0.5)))
+    return found
+
+
+@pytest.mark.parametrize(("metres", "degrees"), [(0.012, 0.5), (0.003, 0.25)])
+def test_errors_at_a_distance_of_1_are_found_beneath_those_of_the_images(metres: float, degrees: float) -> None:
+    found = measured(left_out(metres, degrees, 200))
+    assert 0.9 * metres < found.position_m < 1.7 * metres  # some of the far ones count
+    assert 0.9 * degrees < np.degrees(found.rotation_rad) < 1.7 * degrees
+    assert (found.position_freedom, found.rotation_freedom, found.keyframes) == (300.0, 300.0, 200)
+    assert measured([]) == PoseErrors(0.0, 0.0, 0.0, 0.0, 0)
+
+
+def test_exact_poses_have_none() -> None:
+    random = np.random.default_rng(4)
+    covariance = np.diag(np.repeat([0.002, 0.001], 3) ** 2)
+    exact = [LeftOut(random.normal(size=6) * 0.0005, covariance, AtQuery((1.0, 1.0), STILL, 1.0)) for _ in range(12)]
+    found = measured(exact)
+    assert found.position_m < 1e-4
+    assert found.rotation_rad < 1e-4
+
+
+def test_another_clock_is_no_drift() -> None:
+    random = np.random.default_rng(5)
+    turning = []
+    for one in left_out(0.003, 0.1, 40):
+        turn = random.normal(size=3) * 0.03
+        error = one.error + np.r_[0, 0, 0, MODEL.clock * turn]
+        turning.append(LeftOut(error, one.covariance, AtQuery(one.at.nearest, turn, 0.5)))
+    drifting = [LeftOut(one.error, one.covariance, AtQuery(one.at.nearest, STILL, 0.5)) for one in turning]
+    assert np.degrees(measured(turning).rotation_rad) < 0.2 < np.degrees(measured(drifting).rotation_rad)
 
 
 def test_what_is_usual_counts_where_little_is_known() -> None:
     assert shrunk(None, []).position_m == pytest.approx(USUAL.position_m)
-    little, much = PoseErrors(0.0003, 0.0002, 4.0, 4.0), PoseErrors(0.0003, 0.0002, 200.0, 200.0)
-    assert shrunk(None, [little]).position_m == pytest.approx((USUAL.position_m**2 * 0.0003) ** (1 / 3))
+    little, much = PoseErrors(0.0003, 0.0002, 3.0, 3.0), PoseErrors(0.0003, 0.0002, 200.0, 200.0)
+    assert shrunk(None, [little]).position_m == pytest.approx((USUAL.position_m * 0.0003) ** 0.5)
     assert 0.0003 < shrunk(None, [much]).position_m < 0.00035
     assert shrunk(None, [PoseErrors(0.0, 0.0, 200.0, 200.0)]).position_m < 2e-5
 
@@ -42,31 +93,78 @@ def test_recordings_share_by_the_pairs_of_their_keyframes() -> None:
     assert weighted([None], [5]) == []
 
 
-def test_errors_grow_with_the_distance_and_the_turn_of_the_query() -> None:
-    far_off, exact = PoseErrors(0.008, 0.0055, 90.0, 60.0), PoseErrors(0.0003, 0.0002, 90.0, 60.0)
-    metres, radians = recorded_sigma(far_off, QUERY)
-    assert 0.003 < metres < 0.02
-    assert 0.002 < radians < 0.01
-    further = recorded_sigma(far_off, AtQuery((1.6, 1.6), QUERY.position_m, QUERY.rotation_rad, QUERY.turn_rad))
-    assert 1.2 < further[0] / metres < 2
-    assert 1.2 < further[1] / radians < 2
-    turning = recorded_sigma(far_off, AtQuery(QUERY.nearest, QUERY.position_m, QUERY.rotation_rad, 0.05))
-    assert turning[0] > metres
-    assert turning[1] > radians
-    assert recorded_sigma(exact, QUERY)[0] < 1e-4
-    assert recorded_sigma(exact, QUERY)[1] < 3e-4
+def test_errors_grow_with_the_distance_and_along_the_turn_of_the_query() -> None:
+    errors = PoseErrors(0.008, 0.0055, 90.0, 60.0)
+    near, far = (recorded_errors(errors, AtQuery((distance, distance), STILL, 0.5)) for distance in (0.8, 1.6))
+    np.testing.assert_allclose(np.sqrt(np.diag(near)), np.repeat([0.008, 0.0055], 3) * times(0.8))
+    np.testing.assert_allclose(np.sqrt(np.diag(far)), np.repeat([0.008, 0.0055], 3) * times(1.6))
+    one = recorded_errors(errors, AtQuery((0.8, 0.8), STILL, 1.0))
+    assert np.sqrt(one[0, 0] / near[0, 0]) == pytest.approx(2**MODEL.alone_power)  # nothing cancels
+    turning = recorded_errors(errors, AtQuery((0.8, 0.8), np.array([0.0, 0.05, 0.0]), 0.5))
+    added = turning - near
+    assert np.sqrt(added[4, 4]) == pytest.approx(MODEL.clock * 0.05)
+    added[4, 4] = 0.0
+    np.testing.assert_allclose(added, 0.0, atol=1e-18)  # about no other axis, and nothing of the place
 
 
-def test_errors_beyond_those_of_the_fit_count_in_proportion() -> None:
-    still = AtQuery(QUERY.nearest, QUERY.position_m, QUERY.rotation_rad, 0.0)
-    metres = [recorded_sigma(PoseErrors(of, 0.005, 90.0, 60.0), still)[0] for of in (0.008, 0.016, 0.032, 0.08)]
-    assert metres[1] / metres[0] == pytest.approx(8.0)
-    assert metres[2] / metres[1] == pytest.approx(2.0)
-    assert metres[3] / metres[1] == pytest.approx(5.0)
+def test_a_turn_is_that_beyond_those_of_the_keyframes() -> None:
+    pose = pose_from(so3_exp([0, 0, np.pi / 2]), [1.0, 2.0, 3.0])
+    turns = np.array([[0.05, 0.0, 0.0], [0.01, 0.0, 0.0], [0.03, 0.0, 0.0]])
+    found = at_query((0.7, 0.8), turns, [30, 10], pose)
+    np.testing.assert_allclose(found.turn, [0.0, 0.035, 0.0], atol=1e-12)
+    assert (found.nearest, found.alone) == ((0.7, 0.8), pytest.approx(0.625))
+    nobody = at_query((0.7, 0.8), turns, [0, 0], pose)
+    np.testing.assert_allclose(nobody.turn, [0.0, 0.03, 0.0], atol=1e-12)
+    assert nobody.alone == pytest.approx(0.5)
 
 
-def test_sigma_of_a_query_is_along_an_axis() -> None:
-    covariance = np.diag([1e-4, 4e-4, 4e-4, 1e-6, 1e-6, 4e-6])
-    query = at_query(covariance, (0.5, 0.6), np.array([0.0, 0.03, 0.04]))
-    assert (query.position_m, query.rotation_rad) == pytest.approx((np.sqrt(3e-4), np.sqrt(2e-6)))
-    assert (query.nearest, query.turn_rad) == ((0.5, 0.6), pytest.approx(0.05))
+def bent_recording(
+    random: np.random.Generator, metres: float, degrees: float
+) -> tuple[list[FloatArray], list[FloatArray]]:
+    """Poses of a camera that passes by the scene, true and as a recording has them, which bends them smoothly."""
+    true, recorded = [], []
+    phase, rates = random.uniform(0, 2 * np.pi, 6), random.uniform(0.1, 0.2, 6)
+    size = np.repeat([metres, np.radians(degrees)], 3)
+    for number in range(FRAMES):
+        off = size * np.sin(phase + rates * number)
+        pose = pose_from(so3_exp([0, 0.25 * np.sin(number / 8), 0]), [0.05 * (number - FRAMES / 2), 0.1, 0.0])
+        true.append(pose)
+        recorded.append(pose_from(so3_exp(off[3:]) @ pose[:3, :3], pose[:3, 3] + off[:3]))
+    return true, recorded
+
+
+def nearest(pose: FloatArray, keyframes: Sequence[KeyframeView], count: int) -> list[KeyframeView]:
+    others = [one for one in keyframes if one.world_from_camera is not pose]
+    order = np.argsort(pose_distances(pose, np.stack([one.world_from_camera for one in others])), kind="stable")
+    return [others[n] for n in order[:count]]
+
+
+@pytest.mark.parametrize(("metres", "degrees"), [(0.02, 0.6), (0.0, 0.0)])
+def test_covariances_of_a_recording_that_drifts_are_true(metres: float, degrees: float) -> None:
+    random, errors, sigmas = np.random.default_rng(3), [], []
+    options = LocalizerOptions()
+    for seed in range(2 if metres else 1):
+        scene, numbers = Scene(seed, 200), ClassNumbers()
+        true, recorded = bent_recording(random, metres, degrees)
+        keyframes = []
+        for n in range(0, FRAMES, 4):
+            seen = scene.keypoints(true[n], pixel_noise=0.5)
+            keyframes.append(make_keyframe_view(n, CAMERA, recorded[n], seen, scene.categories, numbers))
+        out = [localized_among(own, nearest(own.world_from_camera, keyframes, 5), options) for own in keyframes]
+        known = measured([one for one in out if one is not None])
+        assert known.keyframes == len(keyframes)
+        for n in range(1, FRAMES - 2, 4):
+            query = scene.query(true[n], numbers, pixel_noise=0.5)
+            among = [replace(one, pose_errors=known) for one in nearest(recorded[n], keyframes, 3)]
+            found = estimate_pose(query, among, match_views(query, among, options.pose), options.pose)
+            assert found is not None
+            covariance = recorded_covariance(found)
+            offset = pose_offset(found.world_from_camera, recorded[n])
+            parts = (slice(3), slice(3, 6))
+            errors.append([offset[of] @ np.linalg.solve(covariance[of, of], offset[of]) for of in parts])
+            sigmas.append(np.sqrt(np.trace(covariance[:3, :3]) / np.trace(found.covariance[:3, :3])))
+    place, turn = np.median(errors, axis=0)
+    assert 0.4 < place < 4
+    assert 0.4 < turn < 4
+    assert (np.array(errors) < 7.815).mean(axis=0).min() > 0.88
+    assert np.median(sigmas) > 1.2 if metres else np.median(sigmas) < 1.001  # exact poses add nothing
