@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
 
-from semdb.cli.output import print_lines, print_painted
+from semdb.cli.output import SIGMA_NOTE, print_lines, print_painted
 from semdb.cli.progress import say
 from semdb.door.values import Answer
 from semdb.errors import UsageError
@@ -19,7 +19,6 @@ from semdb.shown import measure
 from semdb.types import FloatArray, Verdict
 
 COLOURS = {Verdict.LOCALIZED: "green", Verdict.AMBIGUOUS: "yellow", Verdict.COARSE: "magenta", Verdict.FAILED: "red"}
-SIGMA_NOTE = "one standard deviation, by the covariance, where it is largest"
 
 
 def print_answer(answer: Answer) -> None:

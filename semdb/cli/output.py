@@ -18,6 +18,7 @@ from semdb.shown import for_json, for_terminal, number, width
 
 FORMATS = ("table", "csv", "json")
 _COLOURS = {"green": "32", "yellow": "33", "red": "31"}
+SIGMA_NOTE = "one standard deviation against the poses of the map's keyframes, where it is largest"
 MOST_HELD = 2**25  # characters of rows in memory, of statements that may give any number of them
 
 

@@ -249,7 +249,7 @@ class Output:
 
     def add(self, answer: Tracked) -> None:
         """The answer for the next frame."""
-        from semdb.cli.output import print_lines
+        from semdb.cli.output import SIGMA_NOTE, print_lines
 
         if self._poses is not None and answer.tracking and answer.world_from_camera is not None:
             time_ns = round(answer.time_s * 1e9) if answer.timestamp_ns is None else answer.timestamp_ns
@@ -259,7 +259,7 @@ class Output:
             return
         if not self._begun:
             self._begun = True
-            print_lines(f"in map {answer.map}; sigma is one standard deviation, where it is largest", self.HEAD)
+            print_lines(f"in map {answer.map}; sigma is {SIGMA_NOTE}", self.HEAD)
         print_lines(self._line(answer))
         self._number += 1
 

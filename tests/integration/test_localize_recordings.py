@@ -164,7 +164,7 @@ def test_sigma_says_what_it_is_of(room: Path, url: str) -> None:
     with door.open(url, threads=1) as db:
         answer = db.localize(image)
     [line] = [line for line in semdb("localize", image, url=url).stdout.splitlines() if "sigma" in line]
-    note = "(one standard deviation, by the covariance, where it is largest)"
+    note = "(one standard deviation against the poses of the map's keyframes, where it is largest)"
     assert line == f"  sigma       position {1000 * answer.sigma_m:.1f} mm, rotation {answer.sigma_deg:.2f} deg {note}"
 
 
