@@ -30,11 +30,11 @@ class ErrorModel:
     and keyframes during the readout, since the clock of the poses is not that of the images.
     """
 
-    place_power: float = 1.05
-    place_near: float = 0.15
-    alone_power: float = 0.25
-    turn_power: float = 1.1
-    turn_near: float = 0.25
+    place_power: float = 1.1
+    place_near: float = 0.2
+    alone_power: float = 0.5
+    turn_power: float = 1.25
+    turn_near: float = 0.3
     clock: float = 0.33
     tail: float = 5.0  # degrees of freedom of Student's t that errors of keyframes are taken to have: some are far off
     alike: float = 0.5  # of the numbers of keyframes count: neighbours err alike
