@@ -37,7 +37,6 @@ class LaidOptions:
     least_confidence: float = 0.1  # of keypoints at that pose: equal doors of a corridor have .01 to .05 of it
     convinced_likeness: float = 0.65  # where keypoints are many, and yet in doubt: a room of the same shapes shows
     convinced_confidence: float = 0.9  # other textures, which shapes do not see
-    least_alike_in_all: float = 0.0  # by measured depth, of what query and best keyframe show at that pose
     same_m: float = 0.05  # the keypoints' own pose is this one if it is no further off
     same_deg: float = 3.0
 

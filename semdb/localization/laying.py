@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from semdb.localization.alike import WithDepth, alike_of
 from semdb.localization.confidence import Evidence
 from semdb.localization.edge_alignment import measure_edges, search_edges
 from semdb.localization.edge_step import EdgeVerdictOptions, weigh_edges
@@ -13,9 +12,9 @@ from semdb.localization.edges import image_edges
 from semdb.localization.keyframe_cache import KeyframeCache
 from semdb.localization.laid_pose import LaidOptions, LaidPose, estimate_with, is_one, judge_with, may_overrule
 from semdb.localization.pose import PoseEstimate, find_rival
-from semdb.localization.search import Search, evidence_of, seen_by
+from semdb.localization.search import Search, evidence_of
 from semdb.localization.surface_search import search_surfaces
-from semdb.localization.surface_step import SurfaceVerdictOptions, weigh_surfaces
+from semdb.localization.surface_step import SurfaceVerdictOptions, weigh_surfaces, with_edges
 from semdb.localization.surfaces import Surfaces, surfaces_of
 from semdb.localization.verdict import Judgement, VerdictOptions
 from semdb.types import ConsistentPose, Description, FloatArray, Verdict
@@ -47,7 +46,17 @@ class Laying:
         starts, fit = _starts(search, options.fit.starts), options.fit
         fits = search_surfaces(surfaces, starts, lambda pose: self.cache.surfaces_near(pose, fit.keyframes), fit)
         limits, accept = self._limits(search), search.accept
-        return weigh_surfaces(fits, search.query, search.keyframes, search.matches, options, limits, accept)
+        laid = weigh_surfaces(fits, search.query, search.keyframes, search.matches, options, limits, accept)
+        return laid if laid is None or not laid.is_sure else self._seen_with_edges(laid, options, description)
+
+    def _seen_with_edges(self, laid: LaidPose, options: SurfaceVerdictOptions, description: Description) -> LaidPose:
+        """A pose on surfaces with what the edges of the query say of it: one bare room fits another."""
+        if description.grey is None:
+            return laid
+        fit, pose = options.edges, laid.world_from_camera
+        edges = image_edges(description.camera, description.grey)
+        found = measure_edges(edges, self.cache.edges_near(pose, fit.keyframes), pose, fit.fine[-1])
+        return with_edges(laid, found, options)
 
     def _on_edges(self, search: Search, description: Description) -> LaidPose | None:
         """The pose of a query's edges on those of the map."""
@@ -84,7 +93,6 @@ def with_laid(
     convinced: bool,
     judgement: Judgement,
     evidence: Evidence | None,
-    with_depth: WithDepth,
 ) -> tuple[Judgement, Evidence | None]:
     """Verdict and evidence after a query was laid on the map; the pose with them."""
     before, overrule = search.estimate, False
@@ -94,9 +102,6 @@ def with_laid(
         rival = rival_of(search, found)
         anew = evidence_of(search, found, 0 if rival is None else rival.inliers)
         overrule = may_overrule(convinced, anew, laid, options)
-        if overrule and options.least_alike_in_all > 0:
-            search.alike = alike_of(seen_by(search, found), with_depth)
-            overrule = search.alike is None or search.alike.in_all >= options.least_alike_in_all
         if overrule:
             search.estimate, evidence = found, anew
             search.others.clear()

@@ -251,9 +251,7 @@ class Localizer:
         started = time.perf_counter()
         if not convinced or judgement.verdict is not Verdict.LOCALIZED:
             for laid, options in self.laying.poses(search, description):
-                judgement, evidence = with_laid(
-                    search, laid, options, convinced, judgement, evidence, self.cache.with_depth
-                )
+                judgement, evidence = with_laid(search, laid, options, convinced, judgement, evidence)
                 if laid.is_sure:
                     break
         search.timing_ms["pose"] += _ms_since(started)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
+from semdb.localization.edge_alignment import EdgeFit, EdgeOptions
 from semdb.localization.laid_pose import LaidOptions, LaidPose, Standing, compare, covariance_from, shared_doubts
 from semdb.localization.matching import Matches
 from semdb.localization.surface_alignment import SurfaceFit, SurfaceOptions
@@ -23,6 +24,9 @@ class SurfaceVerdictOptions(LaidOptions):
     least_alike: float = 0.55
     most_through: float = 0.10
     least_correlation: float = 0.6
+    edges: EdgeOptions = field(default_factory=EdgeOptions)
+    least_edges: int = 200  # of the map that should be seen, so that the query's edges tell something
+    least_explained: float = 0.62  # of the query's edges: on the cabinet 0.74 to 1, of bare rooms on others 0.42, 0.50
 
 
 def weigh_surfaces(
@@ -59,6 +63,17 @@ def weigh_surfaces(
             "surface_rival": float(standing.rival),
         },
     )
+
+
+def with_edges(laid: LaidPose, found: EdgeFit | None, options: SurfaceVerdictOptions) -> LaidPose:
+    """`laid` in doubt where the query has edges that the map has not, at that pose (`found`)."""
+    if found is None:
+        return laid
+    numbers = {**laid.numbers, "surface_explained": found.explained}
+    if found.seen < options.least_edges or found.explained >= options.least_explained:
+        return replace(laid, numbers=numbers)
+    doubt = f"only {found.explained:.0%} of the image's edges are in the map where the surfaces fit"
+    return replace(laid, doubts=(*laid.doubts, doubt), numbers=numbers)
 
 
 def covariance_of(fit: SurfaceFit) -> FloatArray:

@@ -7,6 +7,7 @@ import pytest
 
 from semdb.geometry import pose_error, so3_exp
 from semdb.localization.confidence import Evidence, sigmas
+from semdb.localization.edge_alignment import EdgeFit
 from semdb.localization.laid_pose import (
     LaidOptions,
     LaidPose,
@@ -19,6 +20,7 @@ from semdb.localization.laid_pose import (
 )
 from semdb.localization.pairs import join_pairs
 from semdb.localization.pose import PoseEstimate
+from semdb.localization.surface_step import SurfaceVerdictOptions, with_edges
 from semdb.localization.verdict import Judgement
 from semdb.types import FloatArray, Verdict
 
@@ -104,3 +106,17 @@ def evidence(rival: int, likeness: float = 0.9) -> Evidence:
 )
 def test_when_a_laid_pose_stands_against_keypoints(convinced: bool, rival: int, likeness: float, stands: bool) -> None:
     assert may_overrule(convinced, evidence(rival, likeness), laid(()), LaidOptions()) is stands
+
+
+def test_surfaces_are_in_doubt_where_the_image_has_edges_that_the_map_has_not() -> None:
+    options, sure = SurfaceVerdictOptions(), laid(())
+
+    def measured(explained: float, seen: int = 1000) -> EdgeFit:
+        return EdgeFit(np.eye(4), np.eye(6), np.eye(6), seen, 0.3, explained)
+
+    assert with_edges(sure, None, options) is sure
+    assert with_edges(sure, measured(0.74), options).is_sure
+    assert with_edges(sure, measured(0.74), options).numbers == {"surface_explained": 0.74}
+    assert with_edges(sure, measured(0.5, seen=100), options).is_sure  # too few tell nothing
+    [doubt] = with_edges(sure, measured(0.5), options).doubts
+    assert doubt == "only 50% of the image's edges are in the map where the surfaces fit"
