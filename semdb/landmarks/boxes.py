@@ -59,8 +59,7 @@ def upright_box(
     u = local[:, :1] * np.cos(angles) + local[:, 1:2] * np.sin(angles)
     v = local[:, 1:2] * np.cos(angles) - local[:, :1] * np.sin(angles)
     low, high = trim, 1 - trim
-    width = np.quantile(u, high, axis=0) - np.quantile(u, low, axis=0)
-    depth = np.quantile(v, high, axis=0) - np.quantile(v, low, axis=0)
+    width, depth = (np.subtract(*np.quantile(values, (high, low), axis=0)) for values in (u, v))
     if noise is not None:
         turned = frame.T @ noise @ frame
         own_u = turned[0, 0] * np.cos(angles) ** 2 + turned[1, 1] * np.sin(angles) ** 2
@@ -78,7 +77,7 @@ def upright_box(
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     axes = frame @ turn
     own = points @ axes
-    first, last = np.quantile(own, low, axis=0), np.quantile(own, high, axis=0)
+    first, last = np.quantile(own, (low, high), axis=0)
     size = last - first
     if noise is not None:
         size = size * _without_noise(own.var(axis=0), np.diag(axes.T @ noise @ axes))

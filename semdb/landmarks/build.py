@@ -25,6 +25,7 @@ from semdb.landmarks.shape import thing_box, thing_points
 from semdb.landmarks.values import BestView, Landmark, Landmarks, LandmarkState, Member
 from semdb.landmarks.visibility import IN_VIEW, THROUGH, VISIBLE, Sightings, Views, collect, look
 from semdb.landmarks.visits import Presence, visits_of
+from semdb.threads import cores, each
 from semdb.types import Float32Array, FloatArray, Int64Array
 
 Progress = Callable[[int, int], None]
@@ -143,6 +144,7 @@ class _Assembly:
         ends = [*start[1:].tolist(), len(order)][: len(roots)]
         self._rows = {int(r): order[s:e] for r, s, e in zip(roots, start, ends, strict=True)}
         self._views = views
+        self._points: dict[int, FloatArray] = {}  # of each thing, as it is now
         self._first_view = np.searchsorted(views.sighting, np.arange(len(sightings) + 1))
         own = np.zeros(len(views.sighting), np.int64)  # visible points in a mask of the same thing
         offset, number = sighting_table(lifted, sightings)
@@ -159,7 +161,8 @@ class _Assembly:
         Of two clusters that no keyframe saw beside each other, under names that are taken for each other, the one
         whose box lies in the other's most comes first.
         """
-        things = {root: self.landmark(root) for root in sorted(self._rows)}
+        roots = sorted(self._rows)
+        things = dict(zip(roots, each(self.landmark, roots, cores()), strict=True))
         while pairs := self._at_one_place(things):
             done: set[int] = set()
             for _, one, other in pairs:
@@ -169,7 +172,7 @@ class _Assembly:
                 self._rows[one] = np.sort(np.concatenate([self._rows[one], self._rows.pop(other)]))
                 del things[other]
                 things[one] = self.landmark(one)
-        return [self.visited(root, thing) for root, thing in things.items()]
+        return each(lambda item: self.visited(*item), list(things.items()), cores())
 
     def _at_one_place(self, things: Mapping[int, Landmark]) -> list[tuple[int, int, int]]:
         """Pairs of clusters that are one thing: overlap (negative, thousandths), one, other; the surest first."""
@@ -199,6 +202,7 @@ class _Assembly:
         rows, options = self._rows[root], self._options
         members = self._members(rows)
         points = thing_points(self._lifted, members, options.shape)
+        self._points[root] = points
         box = thing_box(self._lifted, members, points, self._gravity.up, options.shape)
         objects = [(k, int(o)) for k, s in sorted(members.items()) for one in sorted(s) for o in self._ordinals(k, one)]
         objects.sort()
@@ -248,7 +252,7 @@ class _Assembly:
             [frame.recording for frame in self._keyframes],
             self._members(rows),
             np.unique(np.concatenate(candidates)),
-            thing.box,
+            (self._points[root], thing.box),
             self._gravity.up,
             (options.shape, options.visit),
         )

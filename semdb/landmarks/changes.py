@@ -24,7 +24,7 @@ LEAST_MISSED = 2  # keyframes that look at the place of a flat thing and find no
 GLIMPSED = 0.2  # of the points that are seen through where most are hidden
 CONTRADICTED = 0.3  # of the points that are seen: something is there
 HIDDEN = 0.7  # how sure it is of a thing that it was not there, of whose place next to nothing was seen
-LEAST_SCORE = 0.35  # of a pair
+LEAST_SCORE, LEAST_FAR, FAR_M = 0.25, 0.45, 2.0  # of a pair that lies together, and of one that lies so far apart
 CARRIED_M = 4.0  # a thing that stands so far away is half as likely the same one
 SIZE_RATIO = 2.5  # of the sides of two boxes: where they differ so, they are half as alike
 UNKNOWN_COLOURS = 0.6
@@ -84,7 +84,9 @@ def find_changes(things: Sequence[VisitedThing]) -> list[Changed]:
     taken: set[int] = set()
     if old and new:
         score = np.array([[alike(one, other) * _both(a, b) for other, b in new] for one, a in old])
-        score = np.where(score >= LEAST_SCORE, score, 0.0)
+        apart = np.array([[_apart(one.before, other.after) or 0.0 for other, _ in new] for one, _ in old])
+        least = LEAST_SCORE + (LEAST_FAR - LEAST_SCORE) * np.minimum(apart / FAR_M, 1.0)
+        score = np.where(score >= least, score, 0.0)
         for row, column in zip(*linear_sum_assignment(-score), strict=True):
             if score[row, column] > 0:
                 one, other = old[row][0], new[column][0]

@@ -21,6 +21,7 @@ from semdb.compiled import kernel
 from semdb.geometry import invert_pose, pose_from, project_to_so3, so3_exp
 from semdb.landmarks.lift import LiftedKeyframe
 from semdb.landmarks.options import RegisterOptions
+from semdb.threads import cores, each
 from semdb.types import FloatArray
 
 LEAST_COMPARED = 50  # points of a keyframe that fall on surfaces of another
@@ -67,7 +68,7 @@ def registered(
     poses = np.array([frame.world_from_camera for frame in lifted], np.float64).reshape(-1, 4, 4)
     if len(lifted) < 2 or options.rounds < 1:
         return Registered(poses, np.full(len(poses), np.nan))
-    surfaces = [surface_of(frame, options) for frame in lifted]
+    surfaces = each(lambda frame: surface_of(frame, options), lifted, cores())
     pairs = _neighbours(surfaces, poses, options)
     start = poses.copy()
     for done in range(options.rounds):
@@ -237,7 +238,9 @@ def _solve(
     count = len(surfaces)
     blocks = np.zeros((len(pairs), 12, 12))
     sides = np.zeros((len(pairs), 12))
-    for row, (i, j) in enumerate(pairs):
+
+    def compare(row: int) -> None:
+        i, j = pairs[row]
         one, other = surfaces[i], surfaces[j]
         pair_equations(
             *(one.points, one.normals, poses[i], other.grid_points, other.grid_normals, poses[j]),
@@ -246,6 +249,8 @@ def _solve(
         weight = min(1.0, options.most_points / max(blocks[row, 0:3, 0:3].trace() * options.point_sigma_m**2, 1e-9))
         blocks[row] *= weight
         sides[row] *= weight
+
+    each(compare, range(len(pairs)), cores())
     index = np.array([[*range(6 * i, 6 * i + 6), *range(6 * j, 6 * j + 6)] for i, j in pairs], np.int64).reshape(-1, 12)
     rows, columns = np.repeat(index, 12, axis=1).ravel(), np.tile(index, (1, 12)).ravel()
     matrix = coo_matrix((blocks.ravel(), (rows, columns)), shape=(6 * count, 6 * count)).tocsc()

@@ -12,8 +12,10 @@ import numpy as np
 from semdb.geometry import invert_pose, transform_points
 from semdb.landmarks.lift import LiftedKeyframe
 from semdb.landmarks.options import SeeOptions
+from semdb.threads import cores, each
 from semdb.types import Float32Array, FloatArray, Int64Array, IntArray
 
+_AT_ONCE = 16  # keyframes, between two words of progress
 IN_VIEW, VISIBLE, OCCLUDED, THROUGH, UNKNOWN = range(5)
 
 
@@ -82,10 +84,11 @@ def look(
     """Looks every sighting up in every keyframe that may have it in view."""
     chosen = np.arange(len(sightings), dtype=np.int64)
     parts: list[tuple[np.ndarray, ...]] = []
-    for number, frame in enumerate(lifted):
-        parts.append(_look_in(number, frame, sightings, chosen, see))
+    for start in range(0, len(lifted), _AT_ONCE):
+        numbers = range(start, min(start + _AT_ONCE, len(lifted)))
+        parts += each(lambda number: _look_in(number, lifted[number], sightings, chosen, see), numbers, cores())
         if progress is not None:
-            progress(number + 1, len(lifted))
+            progress(len(parts), len(lifted))
     return _joined(parts)
 
 

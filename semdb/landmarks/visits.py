@@ -61,14 +61,14 @@ def visits_of(
     recordings: Sequence[int],
     members: Members,
     candidates: Int64Array,
-    box: Box,
+    whole: tuple[FloatArray, Box],
     up: FloatArray,
     options: tuple[ShapeOptions, VisitOptions],
 ) -> tuple[Visit, ...]:
     """The visits of a landmark by number of recording, without those that never had it in view.
 
     `recordings` are those of all keyframes, `members` the sightings of the landmark, `candidates` the keyframes that
-    may have it in view, `box` the landmark's.
+    may have it in view, `whole` the landmark's points ``[n, 3]`` and box.
     """
     shape, visit = options
     by_visit: dict[int, dict[int, Sequence[int]]] = {}
@@ -77,8 +77,9 @@ def visits_of(
     there = set(by_visit) | {recordings[k] for k in candidates.tolist()}
     if len(there) == 1:
         (only,) = there
-        return (Visit(only, Presence.PRESENT, len(members), 0, 0, 0, 0, 0, box),)
-    own = {number: thing_points(lifted, part, shape) for number, part in by_visit.items()}
+        return (Visit(only, Presence.PRESENT, len(members), 0, 0, 0, 0, 0, whole[1]),)
+    alone = len(by_visit) == 1
+    own = {number: whole[0] if alone else thing_points(lifted, part, shape) for number, part in by_visit.items()}
     found = []
     for number in sorted(there):
         others = [points for other, points in sorted(own.items()) if other != number]
@@ -90,7 +91,7 @@ def visits_of(
         presence = Presence.PRESENT if mine else _without(counts, len(known), visit)
         if not mine and not int(counts.sum()):
             continue
-        shown = thing_box(lifted, mine, own[number], up, shape) if mine else None
+        shown = None if not mine else whole[1] if alone else thing_box(lifted, mine, own[number], up, shape)
         seen, through, occluded = (int(value) for value in counts)
         found.append(Visit(number, presence, len(mine), len(known), seen, through, occluded, missed, shown))
     return tuple(found)

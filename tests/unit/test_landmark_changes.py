@@ -65,8 +65,8 @@ def test_a_place_that_is_hidden_in_one_visit_may_be_where_a_thing_came_from() ->
     assert told(cup(1, shown(0), EMPTY), cup(2, HIDDEN, shown(9))) == [("disappeared", 1, None)]
     # half of it is seen through, half is seen
     half = seen(Presence.UNOBSERVED, points=100, seen=36, seen_through=40)
-    assert told(cup(1, shown(0), half), cup(2, EMPTY, shown(0.2))) == [("appeared", None, 2)]
-    assert told(cup(1, shown(0), half, RED), cup(2, EMPTY, shown(0.2), RED)) == [("moved", 1, 2)]
+    assert told(cup(1, shown(0), half), cup(2, EMPTY, shown(1))) == [("appeared", None, 2)]
+    assert told(cup(1, shown(0), half, RED), cup(2, EMPTY, shown(1), RED)) == [("moved", 1, 2)]
 
 
 def test_what_is_gone_here_and_new_there_was_moved_and_each_once() -> None:
