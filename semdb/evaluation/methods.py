@@ -101,6 +101,7 @@ METHODS = {
                 surfaces=None,
                 edges=None,
                 by_depth=None,
+                views=None,
                 blur=None,
                 landmarks=None,
                 fallback=False,
@@ -119,6 +120,7 @@ METHODS = {
                 surfaces=None,
                 edges=None,
                 by_depth=None,
+                views=None,
                 blur=None,
                 landmarks=None,
                 fallback=False,
@@ -157,6 +159,11 @@ METHODS = {
             "semdb-no-likeness",
             "as semdb without comparing by measured depth what query and keyframe show where keypoints are not sure",
             LocalizerOptions(by_depth=None),
+        ),
+        Method(
+            "semdb-no-views",
+            "as semdb without comparing queries in doubt with what the map predicts from each pose",
+            LocalizerOptions(views=None),
         ),
         Method(
             "semdb-no-fallback",

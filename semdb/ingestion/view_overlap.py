@@ -18,6 +18,7 @@ from semdb.types import BoolArray, Camera, Float32Array, FloatArray
 
 GRID_COLUMNS = 32  # samples across an image
 DEPTH_TOLERANCE = 0.1  # share of the depth; neighbours on the grid differ by this much on a surface seen at 15 degrees
+MOST_RATIO = 2.5  # of distances: what one view sees from so much farther away has hardly a keypoint in common
 MIN_KNOWN_SHARE = 0.05  # below this share of valid samples a view says too little to be compared
 
 
@@ -45,7 +46,8 @@ def view_overlap(first: ViewGrid, first_pose: FloatArray, second: ViewGrid, seco
     """Common view of two views of one camera, 0 to 1: the lesser of the two shares of seen points.
 
     A point of one view is seen by the other when it lies inside its image and within 10 % of a depth sample next
-    to it, so what is hidden there does not count; points without valid samples around them do not count at all.
+    to it, so what is hidden there does not count; points without valid samples around them do not count at all. Nor is
+    one seen from more than 2.5 times as far away, or as near: along a corridor each view would hold all before it.
     Poses are ``world_from_camera`` ``[4, 4]``.
     """
     views = ViewStack([first, second], [first_pose, second_pose])
@@ -121,7 +123,7 @@ def _seen_share(depth, rays, pose, target, camera):  # type: ignore[no-untyped-d
             ray = rays[row * columns + column]
             px, py, pz = ray[0] * d, ray[1] * d, ray[2] * d
             z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
-            if z <= 0.01:
+            if z <= 0.01 or z > MOST_RATIO * d or d > MOST_RATIO * z:
                 continue
             x = (pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]) / z
             y = (pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]) / z

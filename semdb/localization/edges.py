@@ -78,7 +78,7 @@ def image_edges(camera: Camera, grey: ImageArray) -> ImageEdges:
     """Those of a `grey` image ``[H, W]``."""
     from semdb.localization.edge_kernels import thin
 
-    seen, image = _without_distortion(camera, grey.astype(np.float32), cv2.INTER_LINEAR)
+    seen, image = without_distortion(camera, grey.astype(np.float32), cv2.INTER_LINEAR)
     soft = cv2.GaussianBlur(image, (0, 0), BLUR)
     gx, gy = (np.asarray(cv2.Sobel(soft, cv2.CV_32F, dx, 1 - dx, ksize=1) / 2, np.float32) for dx in (1, 0))
     step = np.asarray(np.hypot(gx, gy), np.float32)
@@ -99,7 +99,7 @@ def image_edges(camera: Camera, grey: ImageArray) -> ImageEdges:
 def space_edges(camera: Camera, depth: Float32Array, grey: ImageArray) -> SpaceEdges | None:
     """Edges of an image with `depth` ``[H, W]`` metres, in the camera frame; None where none has a depth."""
     found = image_edges(camera, grey)
-    seen, depth = _without_distortion(camera, depth, cv2.INTER_NEAREST)
+    seen, depth = without_distortion(camera, depth, cv2.INTER_NEAREST)
     at_edges = _depth_at_edges(depth)
     v, u = np.nonzero((found.strength > 0) & np.isfinite(at_edges))
     if not len(u):
@@ -123,9 +123,11 @@ def space_edges(camera: Camera, depth: Float32Array, grey: ImageArray) -> SpaceE
     return SpaceEdges(points[rows], tangents[rows] / length[rows, None], cover)
 
 
-def _without_distortion(camera: Camera, image: Float32Array, interpolation: int) -> tuple[Camera, Float32Array]:
-    """`image` ``[H, W]`` at about `ACROSS` pixels as a lens without distortion shows it, and that camera."""
-    step = max(1, round(camera.width / ACROSS))
+def without_distortion(
+    camera: Camera, image: Float32Array, interpolation: int, across: int = ACROSS
+) -> tuple[Camera, Float32Array]:
+    """`image` ``[H, W]`` at about `across` pixels as a lens without distortion shows it, and that camera."""
+    step = max(1, round(camera.width / across))
     width, height = max(camera.width // step, 1), max(camera.height // step, 1)
     middle = (step - 1) / 2
     seen = Camera(

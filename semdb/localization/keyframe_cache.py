@@ -25,12 +25,22 @@ from semdb.localization.fallback import Fallback, fallback_cache
 from semdb.localization.frame_cache import FrameCache
 from semdb.localization.landmark_pose import MapLandmarks
 from semdb.localization.map_landmarks import read_map_landmarks
-from semdb.localization.shape_cache import Local, ShapeCache, There, depth_cache, edge_cache, surface_cache
+from semdb.localization.predicted_view import PlacedView, SmallView, best_seen
+from semdb.localization.shape_cache import (
+    Local,
+    ShapeCache,
+    There,
+    depth_cache,
+    edge_cache,
+    surface_cache,
+    view_cache,
+)
 from semdb.localization.surface_alignment import PlacedSurfaces
 from semdb.localization.views import ClassNumbers, KeyframeView, make_keyframe_view
 from semdb.recordings.images import decode_color_grey, has_size
 from semdb.types import Float32Array, FloatArray, ImageArray, Keypoints, PoseErrors
 
+FAR_VIEWS, ASKED_VIEWS = 30.0, 24  # of `pose_distances`, and keyframes: who looks along a corridor sees far
 FAR_SHAPES = 12.0  # of `pose_distances`: keyframes further off show nothing that a query could lie on
 USED, STALE, NONE, OFF = "used", "stale", "none", "off"  # what becomes of its points
 
@@ -64,6 +74,7 @@ class KeyframeCache:
         self._stale: set[int] = set()  # keyframes whose poses are to be read again
         self._surfaces, self._edges = surface_cache(store), edge_cache(store)
         self._frames = FrameCache(store, map_id, self.numbers) if frames else None
+        self._small_views = view_cache(store)
         self.fallback = fallback
         self._others = None if fallback is None else fallback_cache(store, fallback, self.numbers)
         self._depths = depth_cache(store)
@@ -103,7 +114,7 @@ class KeyframeCache:
             self._frames.forget()
         self._landmarks, self._landmarks_read = None, False
         gone = None if change.everything else change.added | change.gone
-        for shapes in (self._surfaces, self._edges, self._depths):
+        for shapes in (self._surfaces, self._edges, self._depths, self._small_views):
             shapes.forget(gone)
         if self._others is not None:
             self._others.forget(gone)
@@ -291,6 +302,19 @@ class KeyframeCache:
     def edges_near(self, pose: FloatArray, count: int) -> list[PlacedEdges]:
         """Edges of the `count` keyframes nearest to `pose` that have depth, or fewer, in the world."""
         return self._shapes_near(self._edges, pose, count)
+
+    def views_seen_from(self, pose: FloatArray, query: SmallView, count: int) -> list[PlacedView]:
+        """Of the keyframes about `pose` that have depth the `count` that show most of what `query` would see there."""
+        with self._turn:
+            ids, poses = self.near(pose, FAR_VIEWS, (), ASKED_VIEWS)
+            found = [self._small_views.placed(i, world) for i, world in zip(ids, poses, strict=True)]
+            return best_seen([view for view in found if view is not None], pose, query, count)
+
+    def edges_of(self, views: Sequence[PlacedView]) -> list[PlacedEdges]:
+        """The edges of the keyframes that `views` are of, in their order."""
+        with self._turn:
+            found = [self._edges.placed(view.keyframe_id, view.world_from_camera) for view in views]
+            return [edges for edges in found if edges is not None]
 
     def _shapes_near(self, shapes: ShapeCache[Local, There], pose: FloatArray, count: int) -> list[There]:
         with self._turn:

@@ -102,6 +102,8 @@ def with_laid(
         rival = rival_of(search, found)
         anew = evidence_of(search, found, 0 if rival is None else rival.inliers)
         overrule = may_overrule(convinced, anew, laid, options)
+        if search.seen is not None:  # what is predicted decides between places
+            overrule = is_one(laid.world_from_camera, search.seen, options.tolerance(search.accept))
         if overrule:
             search.estimate, evidence = found, anew
             search.others.clear()

@@ -11,6 +11,7 @@ import numpy as np
 from semdb.class_score import strengths
 from semdb.database.planning import check_models
 from semdb.errors import NotFoundError
+from semdb.geometry import invert_pose
 from semdb.localization.alike import LearnedVerdictOptions, alike_of, weigh_learned
 from semdb.localization.blurred import BlurOptions, BlurredKeyframes, blurred_query, extractor_for
 from semdb.localization.coarse import (
@@ -46,6 +47,7 @@ from semdb.localization.pose import (
     PoseEstimate,
     estimate_pose,
     first_pose,
+    first_pose_at,
     match_views,
     recorded_covariance,
 )
@@ -54,6 +56,7 @@ from semdb.localization.search import Search, best_of, best_pairs, candidates_of
 from semdb.localization.sources import TimedSource
 from semdb.localization.surface_step import SurfaceVerdictOptions
 from semdb.localization.verdict import Judgement, VerdictOptions, convinces, judge
+from semdb.localization.view_step import Viewing, ViewOptions, is_like, is_same, is_weak, judge_seen, view_numbers
 from semdb.localization.views import View, in_kind_of, make_view
 from semdb.perception.quality import complaint_of, image_quality, motion_blur
 from semdb.types import (
@@ -85,6 +88,7 @@ class LocalizerOptions:
     surfaces: SurfaceVerdictOptions | None = field(default_factory=SurfaceVerdictOptions)  # of a query with depth
     edges: EdgeVerdictOptions | None = field(default_factory=EdgeVerdictOptions)  # where neither convinces
     by_depth: DepthVerdictOptions | None = field(default_factory=DepthVerdictOptions)  # where keypoints are not sure
+    views: ViewOptions | None = field(default_factory=ViewOptions)  # where poses elsewhere may be right as well
     blur: BlurOptions | None = field(default_factory=BlurOptions)  # of a query that motion has blurred
     landmarks: LandmarkPoseOptions | None = field(default_factory=LandmarkPoseOptions)  # where keypoints fail
     learned: LearnedVerdictOptions | None = None  # of a map of learned features; `for_models` sets it
@@ -129,6 +133,7 @@ class Localizer:
         self.options = (options or LocalizerOptions()).for_models(self.models)
         of = self.options
         self.laying = Laying(cache, of.surfaces, of.edges, of.verdict, of.pose.use_query_depth)
+        self.viewing = None if of.views is None else Viewing(cache, of.views)
         self.confusions = confusions or {}  # class -> classes it is taken for -> weight in millionths
 
     def localize(self, description: Description, accept: Tolerance | None = None) -> Localization:
@@ -249,7 +254,8 @@ class Localizer:
                 search, self.cache.fallback, description, (convinced, judgement, evidence)
             )
         started = time.perf_counter()
-        if not convinced or judgement.verdict is not Verdict.LOCALIZED:
+        judgement, evidence = self._tell_apart(search, description, judgement, evidence)
+        if not (convinced or search.seen is not None) or judgement.verdict is not Verdict.LOCALIZED:
             for laid, options in self.laying.poses(search, description):
                 judgement, evidence = with_laid(search, laid, options, convinced, judgement, evidence)
                 if laid.is_sure:
@@ -355,6 +361,48 @@ class Localizer:
             return None
         alike = alike_of(seen, self.cache.fallback_views)
         return weigh_alone(search.estimate, evidence, seen[2], anew, alike, judgement, options)
+
+    def _tell_apart(
+        self, search: Search, description: Description, judgement: Judgement, evidence: Evidence | None
+    ) -> tuple[Judgement, Evidence | None]:
+        """Where the place is in doubt, poses are told apart by what keyframes predict from them."""
+        viewing, bounds = self.viewing, self.options.verdict.accepting(search.accept)
+        if viewing is None or search.stage == Stage.GIVEN or search.fallback or search.blurred is not None:
+            return judgement, evidence
+        options = viewing.options
+        doubted = judgement.verdict is not Verdict.LOCALIZED or (evidence is not None and is_weak(evidence, options))
+        query = viewing.of(description) if doubted and search.keyframes else None
+        if query is None:
+            return judgement, evidence
+        matched = {keyframe.keyframe_id for keyframe in search.keyframes}
+        kept = list(search.keyframes), list(search.matches), list(search.proposals)
+        more = [proposal for proposal in search.following if proposal.keyframe_id not in matched][: options.more]
+        search.proposals += more
+        self._match(search, [proposal.keyframe_id for proposal in more])
+        standing = viewing.standing(search, query, description)
+        if standing is None or not standing.is_sure(options):
+            search.keyframes, search.matches, search.proposals = kept
+        if standing is None:
+            return judgement, evidence
+        search.view_numbers = view_numbers(standing)
+        pose, own = standing.best.world_from_camera, False
+        if search.estimate is not None:
+            own = is_same(search.estimate.world_from_camera, pose, options.same)
+        if standing.is_sure(options):
+            search.seen = pose
+            before = search.first, search.estimate
+            search.first = first_pose_at(search.query, search.keyframes, search.matches, invert_pose(pose), search.pose)
+            search.estimate = None
+            self._ask_neighbours(search)
+            self._estimate(search)
+            found = search.estimate
+            seen = None if found is None else viewing.see(query, found.world_from_camera)
+            if found is None or seen is None or not is_like(seen, options):
+                search.first, search.estimate = before
+            else:
+                own, search.seen, evidence = True, found.world_from_camera, evidence_of(search, found, 0)
+                search.others.clear()
+        return judge_seen(judgement, evidence, standing, own, options, bounds), evidence
 
     def _by_landmarks(self, search: Search, description: Description, judgement: Judgement) -> Judgement:
         """What landmarks make of an image whose keypoints failed; its confidence stays that of the keypoints."""

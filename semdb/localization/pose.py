@@ -153,9 +153,34 @@ def first_pose(
     pairs = join_pairs(matches)
     points = world_points_of(pairs, keyframes)
     found = robust_pnp(query, pairs, points, options)
-    if found is None:
+    return None if found is None else _first_at(query, keyframes, pairs, points, *found, options)
+
+
+def first_pose_at(
+    query: View,
+    keyframes: Sequence[KeyframeView],
+    matches: Sequence[Matches],
+    camera_from_world: FloatArray,
+    options: PoseOptions,
+) -> FirstPose | None:
+    """As `first_pose`, of a pose that is given; None where no pair agrees on it."""
+    pairs = join_pairs(matches)
+    points = world_points_of(pairs, keyframes)
+    agreeing = reprojection_px(query, camera_from_world, pairs.query, points) < options.max_reprojection_px
+    if not agreeing.any():
         return None
-    camera_from_world, agreeing = found
+    return _first_at(query, keyframes, pairs, points, camera_from_world, agreeing, options)
+
+
+def _first_at(
+    query: View,
+    keyframes: Sequence[KeyframeView],
+    pairs: Pairs,
+    points: FloatArray,
+    camera_from_world: FloatArray,
+    agreeing: BoolArray,
+    options: PoseOptions,
+) -> FirstPose:
     first = _first_support(pairs, agreeing)
     guided = _guided_by_pose(query, keyframes, camera_from_world, options) if options.guided else None
     pairs, points = guided or (pairs, points)

@@ -15,7 +15,7 @@ from semdb.localization.matching import Matches
 from semdb.localization.pose import FirstPose, PoseEstimate
 from semdb.localization.pose_options import PoseOptions
 from semdb.localization.views import KeyframeView, View
-from semdb.types import Candidate, ConsistentPose, Float32Array, Tolerance
+from semdb.types import Candidate, ConsistentPose, Float32Array, FloatArray, Tolerance
 
 
 @dataclass(slots=True)
@@ -38,6 +38,8 @@ class Search:
     fallback: str = ""  # the feature that `query` and `keyframes` are of, where it is not the map's
     fallback_numbers: dict[str, float] = field(default_factory=dict)  # what another feature said
     alike: Alike | None = None  # by measured depth, of a learned feature or where one is not sure
+    seen: FloatArray | None = None  # a pose that is sure by what is predicted from there
+    view_numbers: dict[str, float] = field(default_factory=dict)
     following: tuple[Proposal, ...] = ()
     stage: str = Stage.FILTERED
     ranked: int = 0
@@ -51,7 +53,7 @@ def numbers_of(search: Search, evidence: Evidence | None) -> dict[str, float]:
         found |= laid.numbers
     if search.alike is not None:
         found |= {"alike": search.alike.about, "alike_in_all": search.alike.in_all}
-    found |= search.fallback_numbers
+    found |= search.fallback_numbers | search.view_numbers
     return found | (search.by_landmarks.as_mapping() if search.by_landmarks else {})
 
 

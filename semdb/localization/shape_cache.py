@@ -14,14 +14,17 @@ from semdb.database.store import Store
 from semdb.errors import CodecError, FrameError, NotFoundError
 from semdb.localization.edges import PlacedEdges, SpaceEdges, space_edges
 from semdb.localization.likeness import small_inverse_depth
+from semdb.localization.predicted_view import PlacedView, SmallView, small_view
 from semdb.localization.surface_alignment import PlacedSurfaces, place
 from semdb.localization.surfaces import Surfaces, surfaces_of
+from semdb.perception.quality import with_contrast
 from semdb.recordings.images import decode_color_grey
 from semdb.recordings.registration import decode_registered_depth
 from semdb.types import Float32Array, FloatArray, ImageArray
 
 CAPACITY = 32  # keyframes; about 4 MiB each of surfaces, 0.4 of edges
 DEPTHS = 128  # of 0.13 MiB each
+VIEWS = 128  # keyframes; about 0.3 MiB each
 
 
 class Placed(Protocol):
@@ -117,4 +120,14 @@ def depth_cache(store: Store) -> ShapeCache[Float32Array, PlacedDepth]:
         lambda stored, depth, grey: small_inverse_depth(stored.camera, depth),
         lambda _, inverse, world_from_camera: PlacedDepth(inverse, world_from_camera),
         DEPTHS,
+    )
+
+
+def view_cache(store: Store) -> ShapeCache[SmallView, PlacedView]:
+    """Of the small images from which it is predicted what a query shows."""
+    return ShapeCache(
+        store,
+        lambda stored, depth, grey: small_view(stored.camera, with_contrast(grey)[0], depth),
+        lambda keyframe_id, view, pose: PlacedView(keyframe_id, pose, view),
+        VIEWS,
     )

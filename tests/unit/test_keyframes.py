@@ -48,6 +48,11 @@ def test_overlap_is_the_lesser_of_both_ways() -> None:
     assert near == far == pytest.approx(0.25, abs=0.05)
 
 
+@pytest.mark.parametrize(("times", "share"), [(2.4, 1 / 2.4**2), (2.6, 0.0)])
+def test_what_is_seen_from_much_farther_away_is_not_in_common(times: float, share: float) -> None:
+    assert overlap(wall(1), at(), wall(times), at(z=1 - times)) == pytest.approx(share, abs=0.03)
+
+
 def test_what_is_hidden_does_not_count() -> None:
     behind = wall(4.0)
     behind[:, :160] = 1.0  # the other view has an obstacle before its left half
