@@ -370,7 +370,8 @@ class Localizer:
         if viewing is None or search.stage == Stage.GIVEN or search.fallback or search.blurred is not None:
             return judgement, evidence
         options = viewing.options
-        doubted = judgement.verdict is not Verdict.LOCALIZED or (evidence is not None and is_weak(evidence, options))
+        weak = evidence is not None and is_weak(evidence, options)
+        doubted = weak if judgement.verdict is Verdict.LOCALIZED else judgement.verdict is Verdict.AMBIGUOUS
         query = viewing.of(description) if doubted and search.keyframes else None
         if query is None:
             return judgement, evidence
