@@ -149,7 +149,7 @@ def _equal_vectors(blobs: Sequence[Any]) -> Float32Array | None:
     found = np.empty((len(blobs), (size - start) // 4), np.dtype("<f4"))
     out, at = found.reshape(-1).view(np.uint8).data, 0
     for blob in blobs:
-        if len(blob) != size or blob[:_CHECKED] != head or blob[_HEADER.size : start] != tail:
+        if len(blob) != size or not blob.startswith(head) or not blob.startswith(tail, _HEADER.size):
             return None
         view = memoryview(blob)
         if crc32(view[_HEADER.size :], seed) != int.from_bytes(blob[_CHECKED : _HEADER.size], "little"):

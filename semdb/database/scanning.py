@@ -174,7 +174,8 @@ def _numbers(connection: Connection, query: Select[tuple[int]], step: int) -> In
     rows = query.subquery("packed").c
     width = literal(step * IDS_IN_A_ROW, BigInteger)
     texts = select(func.group_concat(rows.number)).group_by(rows.number - rows.number % width)
-    found = ",".join(str(text) for text in connection.execute(texts).scalars())
+    with in_bulk(connection), connection.execute(texts) as result:
+        found = ",".join(str(text) for (text,) in result.cursor.fetchall())
     return np.sort(np.array(found.split(","), np.int64)) if found else np.empty(0, np.int64)
 
 
@@ -242,8 +243,10 @@ def map_identity(engine: Engine, map_id: int) -> str:
 
 
 def _decoded(rows: list[tuple[int, bytes]], size: int | None, bad: Bad | None) -> tuple[Int64Array, Float32Array]:
-    rows.sort(key=lambda row: row[0])
     found = np.array([row[0] for row in rows], np.int64)
+    if (found[1:] < found[:-1]).any():
+        rows = [rows[place] for place in np.argsort(found, kind="stable").tolist()]
+        found = np.sort(found)
     return found, decode_vectors([row[1] for row in rows], found, size, bad)
 
 

@@ -81,7 +81,7 @@ def read(packets: list[bytes], pieces: list[int], converters: Any = NUMBERS) -> 
 values = st.one_of(st.none(), st.sampled_from(SIZES).map(bytes), st.binary(max_size=40))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(
     st.lists(st.tuples(st.integers(-5, 2**62), values), max_size=300),
     st.lists(st.integers(1, 100_000), max_size=50),
