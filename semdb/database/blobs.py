@@ -170,9 +170,14 @@ class _BulkResult(MySQLResult):  # type: ignore[misc]
 
     def _read_rowdata_packet(self) -> None:
         rows = _Rows(self.connection, self.converters)
-        while not rows.ended:
-            rows.take()
-            rows.receive()
+        try:
+            while not rows.ended:
+                rows.take()
+                rows.receive()
+        except BaseException:
+            if not rows.ended:  # what else is on its way would be taken for the answer to the next statement
+                self.connection._force_close()
+            raise
         self.warning_count, self.has_next = rows.warnings, rows.has_next
         self.connection = None
         self.affected_rows, self.rows = len(rows.found), tuple(rows.found)
@@ -181,6 +186,7 @@ class _BulkResult(MySQLResult):  # type: ignore[misc]
 _HEAD = 4  # bytes before each packet: its size and its number
 _EOF, _ERROR, _NONE = 0xFE, 0xFF, 0xFB
 _LONGEST_EOF = 9
+_LOST = "Lost connection to MySQL server during query"
 _NONSENSE = "the server sent what is no row"
 _SOME = 1 << 20  # bytes that are read at once
 _WHOLE = 0xFFFFFF  # a packet of so many bytes goes on in the next
@@ -262,6 +268,8 @@ class _Rows:
 
     def _count(self, packets: int, first: int) -> None:
         if first != self._connection._next_seq_id:
+            if first == 0:  # MariaDB's farewell when it shuts down
+                raise err.OperationalError(CR.CR_SERVER_LOST, _LOST)
             raise err.InternalError("packets of the server come in another order than they were sent in")
         self._connection._next_seq_id = (first + packets) % 256
 
@@ -285,6 +293,7 @@ class _Rows:
             self.has_next = bool(status & SERVER_STATUS.SERVER_MORE_RESULTS_EXISTS)
             return
         if packet[0] == _ERROR:
+            self.ended = True
             err.raise_mysql_exception(bytes(packet))
         try:
             self.found.append(_row(packet, self._encodings, self._converters))
@@ -310,4 +319,4 @@ def _received(connection: Any, room: memoryview, *, first: bool = False) -> int:
     if count:
         return count
     connection._force_close()
-    raise err.OperationalError(CR.CR_SERVER_LOST, f"Lost connection to MySQL server during query{reason}")
+    raise err.OperationalError(CR.CR_SERVER_LOST, _LOST + reason)

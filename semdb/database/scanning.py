@@ -260,8 +260,10 @@ def _rows(connection: Connection, ids: Int64Array, encoder: int | None) -> list[
     if len(ids) >= DENSE * (last - first + 1):
         keys = set(ids.tolist())
         with in_bulk(connection), connection.execute(query.where(c.keyframe_id.between(first, last))) as result:
-            found = result.cursor.fetchall()  # plain tuples: nothing is to be made of their values
-        return [row for row in found if row[0] in keys]
+            if connection.dialect.name == "sqlite":  # reads as rows are asked for, and may fail then
+                return [(row[0], row[1]) for row in result if row[0] in keys]
+            # the driver has all rows, as plain tuples: nothing is to be made of their values
+            return [row for row in result.cursor.fetchall() if row[0] in keys]
     return [
         (row[0], row[1])
         for keys in _in_chunks(ids.tolist())

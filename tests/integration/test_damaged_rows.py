@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
+import sqlite3
 import subprocess
 import sys
 from collections import Counter
@@ -17,8 +19,8 @@ from sqlalchemy import text
 from semdb.database import refinements, tables
 from semdb.database.codecs import MASK_MAGIC, decode_array, encode_array
 from semdb.database.left_out import MOST_SAID, LeftOut
-from semdb.database.store import Store
-from semdb.errors import CodecError, NotFoundError, UsageError
+from semdb.database.store import Store, open_store
+from semdb.errors import CodecError, DatabaseError, NotFoundError, UsageError
 from semdb.geometry import pose_from
 from semdb.localization.index import MapIndex
 from semdb.localization.index.source import IndexSource
@@ -267,3 +269,28 @@ def test_not_every_damaged_keyframe_is_named() -> None:
             left_out(key, CodecError("x"))
         assert len(said) == MOST_SAID + 1, turn
     assert said[-1] == "of more keyframes something is damaged and left out; the first 10 are named above"
+
+
+def test_a_damaged_page_amid_vectors_is_an_error_of_the_database(tmp_path: Path) -> None:
+    """SQLite finds it while rows are fetched, after the statement has begun."""
+    path = tmp_path / "semdb.sqlite3"
+    with open_store(f"sqlite:///{path}", create=True) as store:
+        map_id, _, ids = fill(store, frame_indexes=range(12))
+    vector = encode_array(np.eye(1, 700, dtype=np.float32)[0])
+    with contextlib.closing(sqlite3.connect(path)) as connection:
+        connection.execute("UPDATE cnn_vectors SET vector = ?", (vector,))
+        connection.commit()
+        connection.execute("VACUUM")
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        (size,) = connection.execute("PRAGMA page_size").fetchone()
+        (root,) = connection.execute("SELECT rootpage FROM sqlite_master WHERE name = 'cnn_vectors'").fetchone()
+    data = bytearray(path.read_bytes())
+    page = data[(root - 1) * size : root * size]
+    cells = int.from_bytes(page[3:5], "big")
+    assert (page[0], cells) == (5, len(ids) - 1)  # of pages of the table, each with a row
+    at = int.from_bytes(page[12 + 2 * (cells - 1) :][:2], "big")
+    last = int.from_bytes(page[at : at + 4], "big")
+    data[(last - 1) * size : last * size] = b"\xaa" * size
+    path.write_bytes(data)
+    with open_store(f"sqlite:///{path}") as store, pytest.raises(DatabaseError, match="is damaged"):
+        list(store.iter_vectors(map_id))

@@ -103,9 +103,26 @@ def test_a_value_of_more_than_a_packet() -> None:
 
 def test_errors_amid_rows_are_those_of_the_server() -> None:
     error = b"\xff" + struct.pack("<H", 1317) + b"#70100Query execution was interrupted"
+    opened = connection(sent([*wire_of([(b"1", b"a")]), error]), [])
+    result = blobs._BulkResult(opened)
+    result.converters = NUMBERS
     with pytest.raises(err.OperationalError, match="interrupted") as raised:
-        read([*wire_of([(b"1", b"a")]), error], [])
+        result._read_rowdata_packet()
     assert raised.value.args[0] == 1317
+    assert not opened.closed  # nothing else is on its way
+
+
+def test_a_server_that_shuts_down_amid_rows_is_lost() -> None:
+    """MariaDB says so in a packet that is not counted."""
+    error = b"\xff" + struct.pack("<H", 1927) + b"#70100Connection was killed"
+    row = sent(wire_of([(b"1", b"a")]))
+    opened = connection(row + sent([error]), [])
+    result = blobs._BulkResult(opened)
+    result.converters = NUMBERS
+    with pytest.raises(err.OperationalError, match="Lost connection to MySQL server during query") as raised:
+        result._read_rowdata_packet()
+    assert raised.value.args[0] == 2013
+    assert opened.closed
 
 
 def test_a_connection_that_ends_is_lost() -> None:
@@ -125,6 +142,7 @@ def test_nonsense_is_refused(data: bytes) -> None:
     result.converters = [("ascii", int)]
     with pytest.raises(err.Error):
         result._read_rowdata_packet()
+    assert opened.closed  # or what it sends besides would be taken for the next answer
 
 
 def test_items_are_worked_out_ahead_of_those_who_use_them() -> None:
