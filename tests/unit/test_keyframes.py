@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,10 +14,10 @@ from hypothesis import strategies as st
 
 from semdb.errors import RecordingError, UsageError
 from semdb.geometry import pose_distances, pose_error, pose_from, so3_exp
-from semdb.ingestion.keyframes import farthest_views, overlap_from_pose_distance, select_keyframes
+from semdb.ingestion.keyframes import _Sharpest, farthest_views, overlap_from_pose_distance, select_keyframes
 from semdb.ingestion.view_overlap import ViewStack, view_grid, view_overlap
 from semdb.recordings import open_recording
-from semdb.types import Camera, Float32Array, FloatArray
+from semdb.types import Camera, Float32Array, FloatArray, ImageArray
 from tests.unit.recording_miniatures import write_tum
 
 CAMERA = Camera(320, 240, 200.0, 200.0, 159.5, 119.5)
@@ -195,3 +198,23 @@ def test_wishes_that_make_no_sense_are_usage_errors(tmp_path: Path, options: dic
     recording = open_recording(write_tum(tmp_path / "walk", n=3))
     with pytest.raises(UsageError, match=message):
         select_keyframes(recording, count=options.get("count"), stride=options.get("stride"))
+
+
+def test_of_frames_that_see_nearly_the_same_the_sharp_one_is_taken() -> None:
+    """Each place is there three times: softened, as it is, and turned away too far to count as the same view."""
+    pattern = np.random.default_rng(0).integers(0, 256, (48, 64), np.uint8).repeat(4, 0).repeat(4, 1)
+    sharp = np.dstack([pattern] * 3)
+    soft = np.asarray(cv2.GaussianBlur(sharp, (0, 0), 3), np.uint8)
+    images = [soft, sharp, soft, soft, sharp, soft]
+    poses = np.stack([at(), at(x=0.01), at(turn_deg=40), at(x=2.01), at(x=2), at(x=2, turn_deg=40)])
+
+    def chosen(of: list[ImageArray], *, sharpest: bool = True) -> list[int]:
+        entries: Any = [SimpleNamespace(index=n, image=image) for n, image in enumerate(of)]
+        recording: Any = SimpleNamespace(read_image=lambda entry: entry.image)
+        prefer = _Sharpest(recording, entries, poses, ()) if sharpest else None
+        overlap_with = lambda i, _: overlap_from_pose_distance(pose_distances(poses[i], poses))  # noqa: E731
+        return sorted(farthest_views(overlap_with, poses, count=None, prefer=prefer).tolist())
+
+    assert chosen(images, sharpest=False) == [0, 2, 3, 5]
+    assert chosen(images) == [1, 2, 4, 5]
+    assert chosen([sharp] * 6) == [0, 2, 3, 5]
