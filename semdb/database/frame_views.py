@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, Engine, and_, delete, insert, or_, select
+from sqlalchemy import Connection, Engine, and_, delete, exists, insert, or_, select
 
 from semdb.database import checked, retry
 from semdb.database.codecs import decode_descriptors, decode_keypoints, encode_descriptors, encode_keypoints
 from semdb.database.columns import POSE_COLUMNS
+from semdb.database.engine import check_packet
 from semdb.database.keyframe_rows import FARTHEST_POINT_M, pose_columns, pose_of
 from semdb.database.reading import Bad
 from semdb.database.tables import cameras, frame_views, keyframes, recordings
@@ -21,6 +22,7 @@ from semdb.types import Camera, FloatArray, Keypoints
 
 FRAMES = "frames"  # the step of `semdb refine`
 CHUNK = 500
+_STATEMENT = 4096  # bytes beside blobs
 _CAMERA = [cameras.c[name] for name in ("width", "height", "fx", "fy", "cx", "cy", "distortion")]
 
 
@@ -72,21 +74,38 @@ def _replace(connection: Connection, recording_id: int, found: Sequence[FrameRow
             "descriptors": encode_descriptors(one.keypoints.features.descriptors, dtype),
             "grey": one.grey,
         }
+        size = _STATEMENT + sum(len(value) for value in row.values() if isinstance(value, bytes))
+        check_packet(connection, size, f"the frame_views row of frame {one.head.frame_index}")
         connection.execute(insert(frame_views), row)  # one by one: blobs go as they are
     return len(kept)
 
 
 def load_frame_heads(engine: Engine, map_id: int, bad: Bad | None = None) -> list[FrameHead]:
-    """Those of a map by keyframe and frame. What is damaged is told to `bad`, or raises CodecError."""
+    """Those of a map by keyframe and frame, but for frames that have become keyframes since: these are there already.
+
+    What is damaged is told to `bad`, or raises CodecError.
+    """
     c = frame_views.c
     pose = [c[name] for name in POSE_COLUMNS]
     joined = frame_views.join(keyframes, keyframes.c.id == c.keyframe_id)
     joined = joined.join(recordings, recordings.c.id == keyframes.c.recording_id)
     joined = joined.join(cameras, cameras.c.id == keyframes.c.camera_id)
     query = select(*pose, c.keyframe_id, c.frame_index, keyframes.c.recording_id, *_CAMERA).select_from(joined)
-    query = query.where(recordings.c.map_id == map_id).order_by(c.keyframe_id, c.frame_index)
+    k = keyframes.alias().c
+    now_one = exists().where(k.recording_id == keyframes.c.recording_id, k.frame_index == c.frame_index)
+    query = query.where(recordings.c.map_id == map_id, ~now_one).order_by(c.keyframe_id, c.frame_index)
+    # by those that have any: a database would begin with all keyframes of the map, of which most have none
+    of_any = select(c.keyframe_id).distinct().order_by(c.keyframe_id)
+
+    def work(connection: Connection) -> list[Any]:
+        ids = list(connection.execute(of_any).scalars())
+        rows: list[Any] = []
+        for start in range(0, len(ids), CHUNK):
+            rows += connection.execute(query.where(c.keyframe_id.in_(ids[start : start + CHUNK]))).all()
+        return rows
+
     found = []
-    for row in retry.read(engine, lambda connection: list(connection.execute(query))):
+    for row in retry.read(engine, work):
         where = f"of frame_views of keyframe {row.keyframe_id}"
         try:
             index = checked.integer(row.frame_index, f"frame_index {where}")
@@ -113,8 +132,8 @@ def load_frames(engine: Engine, heads: Sequence[FrameHead], bad: Bad | None = No
     either = or_(*(and_(c.keyframe_id == one.keyframe_id, c.frame_index == one.frame_index) for one in heads))
     blobs = [
         checked.up_to(c.keypoints, checked.MOST_KEYPOINTS),
-        checked.up_to(c.descriptors, checked.MOST_KEYPOINTS),
-        c.grey,
+        checked.up_to(c.descriptors, checked.MOST_DESCRIPTORS),
+        checked.up_to(c.grey, checked.MOST_FILE),
     ]
     query = select(c.keyframe_id, c.frame_index, *blobs).where(either)
     rows = {(row.keyframe_id, row.frame_index): row for row in retry.read(engine, lambda c: list(c.execute(query)))}
@@ -145,4 +164,4 @@ def _frame(head: FrameHead, row: Any) -> FrameRow:
 def _tell(bad: Bad | None, keyframe_id: int, error: CodecError) -> None:
     if bad is None:
         raise error
-    bad(keyframe_id, error)
+    bad(keyframe_id, CodecError(f"{error}; `semdb refine --frames` writes it anew"))

@@ -8,7 +8,7 @@ keyframe, which they move with.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -20,6 +20,7 @@ from semdb.database.store import Store
 from semdb.errors import FrameError, NotFoundError, RecordingError, UsageError
 from semdb.geometry import invert_pose, pose_distances, pose_error
 from semdb.ingestion.keyframes import MIN_OVERLAP, select_keyframes
+from semdb.ingestion.plan import fingerprint
 from semdb.perception.describe import Describer
 from semdb.recordings.base import FrameEntry, Recording
 from semdb.types import FloatArray, Frame, ImageArray, Keypoints
@@ -47,7 +48,7 @@ def add_frames(
     describer: Describer,
     *,
     without: Collection[int] = (),
-    dtype: str = "float32",
+    dtype: str = "auto",
     progress: Progress | None = None,
 ) -> FramesAdded:
     """Frames of `recording`, which the map holds, in place of those that are there of it: again, the same ones.
@@ -59,6 +60,7 @@ def add_frames(
     entries = {entry.index: entry for entry in recording.entries}
     kept = [entries[head.frame_index] for head in known]
     _check_poses(recording, known, kept)
+    _check_plan(store, info, recording, entries)
 
     def selecting(done: int, total: int) -> None:
         if progress is not None:
@@ -136,6 +138,21 @@ def _check_poses(recording: Recording, known: Sequence[KeyframeHead], kept: Sequ
                 f"{recording.path}: keyframe {entry.index} lies {metres:.2f} m and {degrees:.1f} deg otherwise in the "
                 "map than the recording says: its poses were estimated, or this is another recording"
             )
+
+
+def _check_plan(store: Store, info: MapInfo, recording: Recording, entries: Mapping[int, FrameEntry]) -> None:
+    """Whether camera, depth scale, and times and poses of what was ingested are those of `recording`."""
+    plan = store.find_plan(info.name, recording.name)
+    if plan is None or not plan.frame_indexes or any(index not in entries for index in plan.frame_indexes):
+        return  # it cannot be told; where keyframes are was compared
+    planned = [entries[index] for index in plan.frame_indexes]
+    unplaced = [replace(entry, world_from_camera=None) for entry in planned]  # of one whose poses were estimated
+    if plan.fingerprint not in (fingerprint(recording, planned), fingerprint(recording, unplaced)):
+        raise RecordingError(
+            f"{recording.whereabouts}: its camera, its depth scale, or names, times or poses of keyframes are not "
+            f"those that the map {info.name!r} was ingested with: this is another recording, or is read otherwise "
+            "(a URL or db.add_frames takes camera and options as ingest did)"
+        )
 
 
 def _pose(entry: FrameEntry) -> FloatArray:

@@ -34,6 +34,10 @@ class FrameCache:
         self._heads, self._placed = None, None
         self._views.clear()
 
+    def __bool__(self) -> bool:
+        """Whether the map has any."""
+        return bool(self._known())
+
     def head(self, view_id: int) -> FrameHead:
         """What is known of the frame that goes by `view_id`."""
         return self._known()[-view_id - 1]

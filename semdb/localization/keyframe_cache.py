@@ -174,16 +174,25 @@ class KeyframeCache:
                 found.append(replace(own, view=replace(own.view, inverse_depth=depth.inverse)))
         return found
 
-    def frames_near(self, pose: FloatArray, limit: float, count: int) -> list[KeyframeView]:
-        """The `count` frames beside the keyframes that are nearest to `pose`, as `near`. Their ids are negative."""
+    def frames_near(
+        self, pose: FloatArray, limit: float, count: int, descriptors: npt.NDArray[np.generic]
+    ) -> list[KeyframeView]:
+        """The `count` frames beside the keyframes that are nearest to `pose`, as `near`. Their ids are negative.
+
+        One that has not such `descriptors` as it is to be compared with is left out.
+        """
         if self._frames is None:
             return []
         with self._turn:
+            if not self._frames:  # most maps: where their keyframes are need not be read
+                return []
             ids, poses = self._read_poses()
             found = self._frames.near(pose, limit, count, ids, poses)
             errors = self._known_errors()
             return [
-                replace(one, pose_errors=errors.get(self._frames.head(one.keyframe_id).recording_id)) for one in found
+                replace(one, pose_errors=errors.get(self._frames.head(one.keyframe_id).recording_id))
+                for one in found
+                if _are_comparable(one.view.descriptors, descriptors)
             ]
 
     def _load(self, missing: Sequence[int]) -> None:
@@ -239,8 +248,7 @@ class KeyframeCache:
         own = keyframe.view.descriptors
         if descriptors is None:
             return True
-        alike = own.dtype == descriptors.dtype or {own.dtype.name, descriptors.dtype.name} == {"float32", "int8"}
-        if alike and own.shape[1] == descriptors.shape[1]:
+        if _are_comparable(own, descriptors):
             return True
         where = f"descriptors.data of keyframe {keyframe.keyframe_id}"
         theirs = f"{descriptors.dtype} with {descriptors.shape[1]}"
@@ -365,6 +373,11 @@ class KeyframeCache:
             self._poses = ids[order].tolist(), np.concatenate([self._poses[1][kept], new_poses])[order]
         self._stale.clear()
         return self._poses
+
+
+def _are_comparable(one: npt.NDArray[np.generic], other: npt.NDArray[np.generic]) -> bool:
+    alike = one.dtype == other.dtype or {one.dtype.name, other.dtype.name} == {"float32", "int8"}
+    return alike and one.shape[1] == other.shape[1]
 
 
 def with_refined(

@@ -442,7 +442,7 @@ class Localizer:
         if search.blurred is not None:
             return convinced
         started = time.perf_counter()
-        found = self.cache.frames_near(search.first.world_from_camera, FAR, of.frames)
+        found = self.cache.frames_near(search.first.world_from_camera, FAR, of.frames, search.query.descriptors)
         if found:
             search.proposals += [Proposal(one.keyframe_id, float("nan"), float("nan")) for one in found]
             search.keyframes += found

@@ -124,6 +124,12 @@ def test_what_is_no_recording_of_the_map_is_named(room: Path, store: Store, tmp_
     bare = tuple(replace(entry, world_from_camera=None) for entry in recording.entries)
     with pytest.raises(RecordingError, match="brings no pose of frame"):
         add_frames(store, info, replace(recording, entries=bare), describer())
+    scaled = replace(recording, depth_scale=1234.0)
+    with pytest.raises(RecordingError, match=r"depth scale.* are not those that the map 'room' was ingested with"):
+        add_frames(store, info, scaled, describer())
+    later = tuple(replace(entry, timestamp_ns=entry.timestamp_ns + 1) for entry in recording.entries)
+    with pytest.raises(RecordingError, match="this is another recording"):
+        add_frames(store, info, replace(recording, entries=later), describer())
     other = replace(recording, entries=recording.entries[:1])
     with pytest.raises(RecordingError, match="another recording of that name"):
         add_frames(store, info, other, describer())
@@ -143,6 +149,51 @@ def test_a_damaged_row_is_left_out(room: Path, store: Store, caplog: pytest.LogC
     assert localizer(store, 2).localize(found).verdict is not None
     assert "frame_views.grey of keyframe" in caplog.text
     write_frame_views(store.engine, 1, rows)
+
+
+def test_a_frame_that_has_become_a_keyframe_is_not_there_twice(room: Path, url: str, tmp_path: Path) -> None:
+    copy = tmp_path / "copy.sqlite3"
+    shutil.copy(url.removeprefix("sqlite:///"), copy)
+    with semdb.open(f"sqlite:///{copy}", detector="recorded", encoder="gist", features="surf", threads=1) as db:
+        db.ingest(room, map="room", keyframes=KEYFRAMES + 3)
+    with open_store(f"sqlite:///{copy}") as store, open_store(url) as before:
+        keyframes = {head.frame_index for head in store.keyframe_heads(1)}
+        old = {head.frame_index for head in load_frame_heads(before.engine, 1)}
+        assert len(keyframes) == KEYFRAMES + 3
+        assert keyframes & old
+        assert {head.frame_index for head in load_frame_heads(store.engine, 1)} == old - keyframes
+
+
+def test_frames_of_other_descriptors_are_left_out(room: Path, store: Store) -> None:
+    recording = open_recording(room)
+    frame = recording.read(recording.entries[1])
+    found = describer().describe(frame.image, None, frame.camera, frame.instances)
+    rows = load_frames(store.engine, load_frame_heads(store.engine, 1))
+    features = [one.keypoints.features for one in rows]
+    short = [replace(one, descriptors=np.ascontiguousarray(one.descriptors[:, :32])) for one in features]
+    broken = [
+        replace(row, keypoints=replace(row.keypoints, features=one)) for row, one in zip(rows, short, strict=True)
+    ]
+    write_frame_views(store.engine, 1, broken)
+    without, answer = (localizer(store, count).localize(found) for count in (0, 2))
+    write_frame_views(store.engine, 1, rows)
+    np.testing.assert_array_equal(answer.world_from_camera, without.world_from_camera)
+
+
+def test_a_copy_of_a_map_has_them_and_smaller_keyframes_leave_them(url: str, tmp_path: Path) -> None:
+    with semdb.open(url) as db:
+        db.export("semdb", "room", tmp_path / "out")
+    made = f"sqlite:///{tmp_path / 'other.sqlite3'}"
+    with semdb.open(made) as db:
+        db.import_map(tmp_path / "out", map="copy")
+        db.compact("copy")
+    with open_store(url) as store, open_store(made) as copy:
+        own = load_frames(store.engine, load_frame_heads(store.engine, 1))
+        theirs = load_frames(copy.engine, load_frame_heads(copy.engine, 1))
+        assert [one.head.frame_index for one in own] == [one.head.frame_index for one in theirs]
+        for one, other in zip(own, theirs, strict=True):
+            assert one.grey == other.grey
+            np.testing.assert_array_equal(one.keypoints.points, other.keypoints.points)
 
 
 def test_the_command(room: Path, url: str, tmp_path: Path) -> None:
