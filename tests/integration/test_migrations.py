@@ -261,11 +261,11 @@ def test_keyframes_of_before_have_no_frames_beside_them(engine: Engine, empty_ur
         assert load_frame_heads(engine, map_id) == []
         nowhere = np.full(len(known[0].keypoints), -1, np.int32)
         keypoints = replace(known[0].keypoints, object_index=nowhere)
-        head = FrameHead(ids[0], 7, np.eye(4), known[0].camera, recording_id)
+        head = FrameHead(ids[0], 8, np.eye(4), known[0].camera, recording_id)
         gone = replace(head, keyframe_id=max(ids) + 1000)
         assert write_frame_views(engine, recording_id, [FrameRow(one, keypoints, b"grey") for one in (head, gone)]) == 1
         [found] = load_frames(engine, load_frame_heads(engine, map_id))
-        assert (found.head.frame_index, found.head.camera, found.grey) == (7, known[0].camera, b"grey")
+        assert (found.head.frame_index, found.head.camera, found.grey) == (8, known[0].camera, b"grey")
         np.testing.assert_array_equal(found.head.keyframe_from_camera, np.eye(4))
         np.testing.assert_array_equal(found.keypoints.points, keypoints.points)
         np.testing.assert_array_equal(found.keypoints.features.descriptors, keypoints.features.descriptors)
