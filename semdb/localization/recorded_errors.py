@@ -36,6 +36,7 @@ class ErrorModel:
     turn_power: float = 1.25
     turn_near: float = 0.3
     clock: float = 0.33
+    clock_from_rad: float = 0.002  # of a recording's errors: with less its clock is the images'
     tail: float = 5.0  # degrees of freedom of Student's t that errors of keyframes are taken to have: some are far off
     alike: float = 0.5  # of the numbers of keyframes count: neighbours err alike
     usual: PoseErrors = USUAL
@@ -143,8 +144,9 @@ def _scaled(one: PoseErrors, share: float) -> PoseErrors:
 def recorded_errors(errors: PoseErrors, at: AtQuery, model: ErrorModel = MODEL) -> FloatArray:
     """Covariance ``[6, 6]`` of how far a pose recorded where the query is would be off what the images show."""
     found = np.zeros((6, 6))
+    believed = min(errors.rotation_rad / model.clock_from_rad, 1.0) ** 4
     for part, of in ((PLACE, errors.position_m), (TURN, errors.rotation_rad)):
-        found[part, part] = (of * _growth(at, part, model)) ** 2 * np.eye(3) + _of_clock(at, part, model)
+        found[part, part] = (of * _growth(at, part, model)) ** 2 * np.eye(3) + believed * _of_clock(at, part, model)
     return found
 
 

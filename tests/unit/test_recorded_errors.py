@@ -105,6 +105,8 @@ def test_errors_grow_with_the_distance_and_along_the_turn_of_the_query() -> None
     assert np.sqrt(added[4, 4]) == pytest.approx(MODEL.clock * 0.05)
     added[4, 4] = 0.0
     np.testing.assert_allclose(added, 0.0, atol=1e-18)  # about no other axis, and nothing of the place
+    exact = recorded_errors(PoseErrors(1e-5, 1e-5, 90.0, 60.0), AtQuery((0.8, 0.8), np.array([0.0, 0.05, 0.0]), 0.5))
+    assert np.sqrt(exact).max() < 3e-5  # where poses are exact, so is their clock
 
 
 def test_a_turn_is_that_beyond_those_of_the_keyframes() -> None:
