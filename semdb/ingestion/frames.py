@@ -67,10 +67,12 @@ def add_frames(
             progress(f"looking at the frames of {recording.name}", done, total)
 
     there = {entry.index for entry in kept}
+    noted = len(recording.decode_failures)
     usable = tuple(entry for entry in recording.entries if entry.index in there or entry.index not in without)
     chosen = select_keyframes(
         replace(recording, entries=usable), keep=kept, min_overlap=MIN_OVERLAP, progress=selecting
     )
+    unreadable = [one.reason for one in recording.decode_failures[noted:]]  # their depth, which is compared
     new = [entry for entry in chosen if entry.index not in there]
     rows, failed = [], []
     for done, entry in enumerate(new, start=1):
@@ -83,7 +85,7 @@ def add_frames(
     if failed and not rows:
         raise RecordingError(f"{recording.path}: no frame can be used, the first: {failed[0]}")
     count = write_frame_views(store.engine, recording_id, rows, dtype)
-    return FramesAdded(recording.name, count, len(kept), tuple(failed))
+    return FramesAdded(recording.name, count, len(kept), (*unreadable, *failed))
 
 
 def map_with(store: Store, recording: Recording, name: str | None) -> MapInfo:

@@ -164,6 +164,21 @@ def test_a_frame_that_has_become_a_keyframe_is_not_there_twice(room: Path, url: 
         assert {head.frame_index for head in load_frame_heads(store.engine, 1)} == old - keyframes
 
 
+def test_frames_that_cannot_be_read_are_named(room: Path, url: str, tmp_path: Path) -> None:
+    shutil.copytree(room, tmp_path / room.name)
+    shutil.copy(url.removeprefix("sqlite:///"), tmp_path / "copy.sqlite3")
+    with open_store(f"sqlite:///{tmp_path / 'copy.sqlite3'}") as store:
+        recording = open_recording(tmp_path / room.name)
+        free = {entry.index for entry in recording.entries} - {head.frame_index for head in store.keyframe_heads(1)}
+        broken = next(entry for entry in recording.entries if entry.index == min(free))
+        assert broken.depth_path is not None
+        broken.depth_path.write_bytes(broken.depth_path.read_bytes()[:200])
+        added = add_frames(store, store.find_map("room"), recording, describer())
+        assert added.frames
+        assert [broken.depth_path.name in line for line in added.failed] == [True]
+        assert min(free) not in {head.frame_index for head in load_frame_heads(store.engine, 1)}
+
+
 def test_frames_of_other_descriptors_are_left_out(room: Path, store: Store) -> None:
     recording = open_recording(room)
     frame = recording.read(recording.entries[1])
