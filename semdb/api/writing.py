@@ -228,6 +228,7 @@ class Writing(Reading):
                     _, own = describers_for(info.name, has_masks, store, self.settings, known)
                     dtype = self.settings.descriptor_dtype
                     found.append(add_frames(store, info, recording, own[0], dtype=dtype, progress=progress))
+                self._here.maps().frames_anew()
         return found
 
     def tell_up(self, map: str, up: Sequence[float] | None) -> None:

@@ -164,6 +164,18 @@ def test_a_frame_that_has_become_a_keyframe_is_not_there_twice(room: Path, url: 
         assert {head.frame_index for head in load_frame_heads(store.engine, 1)} == old - keyframes
 
 
+def test_a_map_that_is_open_takes_what_it_has_added(room: Path, url: str, tmp_path: Path) -> None:
+    copy = tmp_path / "copy.sqlite3"
+    shutil.copy(url.removeprefix("sqlite:///"), copy)
+    with open_store(f"sqlite:///{copy}") as store:
+        write_frame_views(store.engine, 1, [])
+    entry = open_recording(room).entries[5]
+    with semdb.open(f"sqlite:///{copy}", detector="recorded", encoder="gist", features="surf", threads=1) as db:
+        before = db.localize(room / entry.name, map="room").inliers
+        db.add_frames(room)
+        assert db.localize(room / entry.name, map="room").inliers > 1.2 * before
+
+
 def test_frames_that_cannot_be_read_are_named(room: Path, url: str, tmp_path: Path) -> None:
     shutil.copytree(room, tmp_path / room.name)
     shutil.copy(url.removeprefix("sqlite:///"), tmp_path / "copy.sqlite3")
