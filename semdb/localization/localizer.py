@@ -369,6 +369,8 @@ class Localizer:
         viewing, bounds = self.viewing, self.options.verdict.accepting(search.accept)
         if viewing is None or search.stage == Stage.GIVEN or search.fallback or search.blurred is not None:
             return judgement, evidence
+        if self.options.learned is not None and search.alike is not None and judgement.verdict is Verdict.AMBIGUOUS:
+            return judgement, evidence  # a learned feature was refused by what it should look like
         options = viewing.options
         weak = evidence is not None and is_weak(evidence, options)
         doubted = weak if judgement.verdict is Verdict.LOCALIZED else judgement.verdict is Verdict.AMBIGUOUS

@@ -8,7 +8,7 @@ its recorded pose is known (leave-one-out cross-validation). What its images lea
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -41,6 +41,7 @@ class ErrorModel:
     alike: float = 0.5  # of the numbers of keyframes count: neighbours err alike
     usual: PoseErrors = USUAL
     own: float = 0.25  # of what a query itself shows counts
+    exact: float = 0.2  # of what is usual counts where keyframes show that poses are not off at all: rendered ones
 
 
 MODEL = ErrorModel()
@@ -115,7 +116,7 @@ def shrunk(own: PoseErrors | None, known: Sequence[PoseErrors], model: ErrorMode
     Of logarithms, since errors of recordings differ by factors.
     """
     less = [] if own is None else [_scaled(own, model.own)]
-    of = (model.usual, *less, *known)
+    of = (_usual(known, model), *less, *known)
     place, turn = np.array([one.position_freedom for one in of]), np.array([one.rotation_freedom for one in of])
     metres = np.log([max(one.position_m, LEAST_M) for one in of])
     radians = np.log([max(one.rotation_rad, LEAST_RAD) for one in of])
@@ -125,6 +126,23 @@ def shrunk(own: PoseErrors | None, known: Sequence[PoseErrors], model: ErrorMode
         float(place.sum()),
         float(turn.sum()),
     )
+
+
+def _usual(known: Sequence[PoseErrors], model: ErrorModel) -> PoseErrors:
+    """What is usual; it counts the less, the more of what is known says that poses are not off at all."""
+    place = _share([(one.position_freedom, one.position_m <= LEAST_M) for one in known])
+    turn = _share([(one.rotation_freedom, one.rotation_rad <= LEAST_RAD) for one in known])
+    less, usual = 1.0 - model.exact, model.usual
+    return replace(
+        usual,
+        position_freedom=usual.position_freedom * (1.0 - less * place),
+        rotation_freedom=usual.rotation_freedom * (1.0 - less * turn),
+    )
+
+
+def _share(freedoms: Sequence[tuple[float, bool]]) -> float:
+    """The share of those that are marked; 0 of none."""
+    return sum(freedom for freedom, marked in freedoms if marked) / max(sum(freedom for freedom, _ in freedoms), 1e-9)
 
 
 def weighted(known: Sequence[PoseErrors | None], weights: Sequence[float]) -> list[PoseErrors]:

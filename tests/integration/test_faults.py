@@ -142,7 +142,7 @@ def test_connections_are_cut(long_room: Path, some: Store, server_url: str) -> N
         own = engine.connect()
         schema, own_id = own.execute(text("SELECT DATABASE(), CONNECTION_ID()")).one()
         own.execute(text("SET SESSION character_set_results = binary"))  # statements that are shown hold images
-        while not done.wait(0.15):
+        while not done.wait(0.25):
             listed = own.execute(text("SHOW PROCESSLIST")).all()  # id, user, host, schema, ...
             for number in (row[0] for row in listed if row[3] == schema.encode() and row[0] != own_id):
                 try:
