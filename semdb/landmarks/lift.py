@@ -113,7 +113,9 @@ def lift_keyframe(
         )
         body, fitted_too = _points(camera, inner, values, lift.outline // 2, known, owner == k + 1, noise)
         outline.append(np.concatenate([body, edge]))
-        single[k] = 1 - np.mean(np.concatenate([fitted, fitted_too]))
+        planes = np.concatenate([fitted, fitted_too])
+        if len(planes):  # a mask may lie where the lens model says nothing
+            single[k] = 1 - np.mean(planes)
     step = max(1, shape[1] // see.grid)
     half = step // 2
     return LiftedKeyframe(

@@ -38,6 +38,7 @@ from semdb.localization.fallback import (
     weigh_fallback,
 )
 from semdb.localization.keyframe_cache import KeyframeCache
+from semdb.localization.laid_pose import support_of
 from semdb.localization.landmark_pose import LandmarkPoseOptions
 from semdb.localization.landmark_step import landmark_pose
 from semdb.localization.laying import Laying, rival_of, with_laid
@@ -60,6 +61,7 @@ from semdb.localization.view_step import Viewing, ViewOptions, is_like, is_same,
 from semdb.localization.views import View, in_kind_of, make_view
 from semdb.perception.quality import complaint_of, image_quality, motion_blur
 from semdb.types import (
+    ConsistentPose,
     Description,
     FloatArray,
     Localization,
@@ -253,14 +255,15 @@ class Localizer:
             search, convinced, judgement, evidence = self._ask_fallback(
                 search, self.cache.fallback, description, (convinced, judgement, evidence)
             )
-        started = time.perf_counter()
+        started, counted = time.perf_counter(), search.timing_ms["match"] + search.timing_ms["pose"]
         judgement, evidence = self._tell_apart(search, description, judgement, evidence)
         if not (convinced or search.seen is not None) or judgement.verdict is not Verdict.LOCALIZED:
             for laid, options in self.laying.poses(search, description):
                 judgement, evidence = with_laid(search, laid, options, convinced, judgement, evidence)
                 if laid.is_sure:
                     break
-        search.timing_ms["pose"] += _ms_since(started)
+        counted -= search.timing_ms["match"] + search.timing_ms["pose"]  # what was counted meanwhile counts once
+        search.timing_ms["pose"] += _ms_since(started) + counted
         if judgement.verdict is Verdict.FAILED and search.stage != Stage.GIVEN:
             judgement = self._by_landmarks(search, description, judgement)
         if judgement.verdict is not Verdict.LOCALIZED and description.grey is not None:
@@ -316,7 +319,7 @@ class Localizer:
         pose = fallback.pose_options(self.options.pose)
         again = replace(
             search, query=query, pose=pose, fallback=fallback.name, blurred=None, keyframes=[], matches=[], first=None,
-            estimate=None, others=[], proposals=list(search.proposals),
+            estimate=None, others=[], proposals=list(search.proposals), alike=None,
         )  # fmt: skip
         for batch in asked_first(search.keyframes, search.estimate.per_keyframe if search.estimate else ()):
             self._match(again, batch)
@@ -371,7 +374,8 @@ class Localizer:
             return judgement, evidence
         if self.options.learned is not None and search.alike is not None and judgement.verdict is Verdict.AMBIGUOUS:
             return judgement, evidence  # a learned feature was refused by what it should look like
-        options = viewing.options
+        options = viewing.options.accepting(search.accept)
+        viewing = replace(viewing, options=options)
         weak = evidence is not None and is_weak(evidence, options)
         doubted = weak if judgement.verdict is Verdict.LOCALIZED else judgement.verdict is Verdict.AMBIGUOUS
         query = viewing.of(description) if doubted and search.keyframes else None
@@ -399,13 +403,28 @@ class Localizer:
             self._ask_neighbours(search)
             self._estimate(search)
             found = search.estimate
-            seen = None if found is None else viewing.see(query, found.world_from_camera)
-            if found is None or seen is None or not is_like(seen, options):
+            anew = None if found is None else evidence_of(search, found, 0)
+            said = judge(anew, bounds)  # what was said of another pose is not said of this one
+            if (
+                found is None
+                or said.verdict is Verdict.FAILED
+                or not is_like(viewing.see(query, found.world_from_camera), options)
+            ):
                 search.first, search.estimate = before
             else:
-                own, search.seen, evidence = True, found.world_from_camera, evidence_of(search, found, 0)
+                search.alike = search.alike if own else None  # that was of another pose
+                own, search.seen, judgement, evidence = True, found.world_from_camera, said, anew
                 search.others.clear()
-        return judge_seen(judgement, evidence, standing, own, options, bounds), evidence
+        after = judge_seen(judgement, evidence, standing, own, options, bounds)
+        if after.verdict is not judgement.verdict and after.verdict is Verdict.AMBIGUOUS and search.estimate:
+            self._name_others(search, standing.against(search.estimate.world_from_camera, options))
+        return after, evidence
+
+    def _name_others(self, search: Search, poses: Sequence[FloatArray]) -> None:
+        """Poses ``[4, 4]`` elsewhere that stand against the estimate, with the keypoints that vouch for each."""
+        for pose in poses:
+            count = support_of(pose, search.query, search.keyframes, search.matches, search.pose.inlier_px)
+            search.others.append(ConsistentPose(pose, count))
 
     def _by_landmarks(self, search: Search, description: Description, judgement: Judgement) -> Judgement:
         """What landmarks make of an image whose keypoints failed; its confidence stays that of the keypoints."""
@@ -450,7 +469,7 @@ class Localizer:
             search.keyframes += found
             search.matches += match_views(search.query, found, search.pose)
             if not convinced:
-                search.first = first_pose(search.query, search.keyframes, search.matches, search.pose)
+                search.first = first_pose(search.query, search.keyframes, search.matches, search.pose) or search.first
         search.timing_ms["match"] += _ms_since(started)
         return convinced or (bool(found) and convinces(search.first, of.verdict))
 

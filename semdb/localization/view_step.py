@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -49,6 +49,14 @@ class ViewOptions:
     least_inliers: int = 20
     confidence: float = 0.95  # of a pose that is sure
 
+    def accepting(self, accept: Tolerance | None) -> ViewOptions:
+        """The same for a caller who takes poses within `accept` for one."""
+        if accept is None:
+            return self
+        return replace(
+            self, same=Tolerance(max(self.same.metres, accept.metres), max(self.same.degrees, accept.degrees))
+        )
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
@@ -68,13 +76,19 @@ class Seen:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Standing:
-    """The best of several poses by what is predicted; `beaten` those elsewhere that look less like the query there."""
+    """The best of several poses by what is predicted; those elsewhere that look less like the query are beaten."""
 
     best: Seen
     unbeaten: tuple[Seen, ...]  # elsewhere, which may be right as well
+    unseen: int = 0  # poses of which nothing is predicted, since keyframes there have no depth
 
     def is_sure(self, options: ViewOptions) -> bool:
-        return not self.unbeaten and is_like(self.best, options)
+        return not self.unbeaten and not self.unseen and is_like(self.best, options)
+
+    def against(self, pose: FloatArray, options: ViewOptions) -> list[FloatArray]:
+        """Poses ``[4, 4]`` that may be right as well as `pose`, or are better."""
+        found = [seen.world_from_camera for seen in (self.best, *self.unbeaten)]
+        return [other for other in found if not is_same(other, pose, options.same)]
 
 
 def is_like(seen: Seen, options: ViewOptions) -> bool:
@@ -136,23 +150,34 @@ class Viewing:
         return None if description.grey is None else small_view(description.camera, description.grey)
 
     def standing(self, search: Search, query: SmallView, description: Description) -> Standing | None:
-        """Of all poses that pairs with single keyframes give, the rivals and the pose that was found."""
+        """Of all poses that pairs with single keyframes give, the rivals and the pose that was found.
+
+        None where there is no pose, or the keyframes about the one that was found have no depth.
+        """
         poses, options = hypotheses(search, self.options), self.options
         if not poses or description.grey is None:
             return None
         own = [self.see(query, poses.pop(0))] if search.estimate is not None else []  # which keypoints have refined
-        rough = sorted(((-self._rough(query, pose), n) for n, pose in enumerate(poses)))
-        seen = [self.see(query, poses[n]) for _, n in rough[: options.looked_at]]
+        if own and self._is_unseen(own[0].alike, own[0].world_from_camera):
+            return None
+        places = [self._from(query, pose) for pose in poses]
+        rough = sorted(
+            (-compare_view(query, pose, place[: options.roughly], (0,)).alike, n)
+            for n, (pose, place) in enumerate(zip(poses, places, strict=True))
+        )  # about how alike, in a tenth of the time
+        unseen = sum(self._is_unseen(-alike, poses[n]) for alike, n in rough)
+        chosen = [n for _, n in rough[: options.looked_at]]
+        seen = [Seen(poses[n], compare_view(query, poses[n], places[n])) for n in chosen]
         if not seen and not own:
             return None
         if any(one.alike >= options.worth_laying for one in seen):
             edges = image_edges(description.camera, description.grey)
             seen = [self._laid(query, edges, one) if one.alike >= options.worth_laying else one for one in seen]
-        return stand([*own, *seen], options)
+        return replace(stand([*own, *seen], options), unseen=unseen)
 
-    def _rough(self, query: SmallView, pose: FloatArray) -> float:
-        """About how alike, in a tenth of the time."""
-        return compare_view(query, pose, self._from(query, pose)[: self.options.roughly], (0,)).alike
+    def _is_unseen(self, alike: float, pose: FloatArray) -> bool:
+        """Whether that nothing is `alike` says nothing of a pose: keyframes that would show the place have no depth."""
+        return alike == 0 and self.cache.lacks_views(pose)
 
 
 def hypotheses(search: Search, options: ViewOptions) -> list[FloatArray]:
@@ -211,5 +236,5 @@ def view_numbers(standing: Standing) -> dict[str, float]:
     return {
         "view_alike": best.alike,
         "view_known": best.windows.known,
-        "view_rivals": float(len(standing.unbeaten)),
+        "view_rivals": float(len(standing.unbeaten) + standing.unseen),
     }
