@@ -317,21 +317,17 @@ class KeyframeCache:
         """Edges of the `count` keyframes nearest to `pose` that have depth, or fewer, in the world."""
         return self._shapes_near(self._edges, pose, count)
 
-    def views_seen_from(self, pose: FloatArray, query: SmallView, count: int) -> list[PlacedView]:
-        """Of the keyframes about `pose` that have depth the `count` that show most of what `query` would see there."""
-        return best_seen([view for view in self._views_about(pose) if view is not None], pose, query, count)
+    def views_seen_from(self, pose: FloatArray, query: SmallView, count: int) -> tuple[list[PlacedView], bool]:
+        """Of the keyframes about `pose` that have depth the `count` that show most of what `query` would see there.
 
-    def lacks_views(self, pose: FloatArray) -> bool:
-        """Whether a keyframe about `pose` has no depth from which to predict what is seen there."""
-        return any(view is None for view in self._views_about(pose))
-
-    def _views_about(self, pose: FloatArray) -> list[PlacedView | None]:
+        And whether one about it has none.
+        """
         ids, poses = self.near(pose, FAR_VIEWS, (), ASKED_VIEWS)
         found = []
         for keyframe_id, world_from_camera in zip(ids, poses, strict=True):
             with self._turn:  # images are decoded: others get their turn in between
                 found.append(self._small_views.placed(keyframe_id, world_from_camera))
-        return found
+        return best_seen([view for view in found if view is not None], pose, query, count), None in found
 
     def edges_of(self, views: Sequence[PlacedView]) -> list[PlacedEdges]:
         """The edges of the keyframes that `views` are of, in their order."""

@@ -129,15 +129,15 @@ class Viewing:
 
     def see(self, query: SmallView, pose: FloatArray) -> Seen:
         """What is predicted from a pose ``[4, 4]``, compared with the query."""
-        return Seen(pose, compare_view(query, pose, self._from(query, pose)))
+        return Seen(pose, compare_view(query, pose, self._from(query, pose)[0]))
 
-    def _from(self, query: SmallView, pose: FloatArray) -> list[PlacedView]:
+    def _from(self, query: SmallView, pose: FloatArray) -> tuple[list[PlacedView], bool]:
         return self.cache.views_seen_from(pose, query, self.options.keyframes)
 
     def _laid(self, query: SmallView, edges: ImageEdges, seen: Seen) -> Seen:
         """The same with the edges of the query laid on those of the keyframes, where it is more alike then."""
         rounds = self.options.edges
-        views = self._from(query, seen.world_from_camera)[: rounds.keyframes]
+        views = self._from(query, seen.world_from_camera)[0][: rounds.keyframes]
         pose = seen.world_from_camera
         fit = fit_edges(edges, self.cache.edges_of(views), pose, (*rounds.coarse[1:], *rounds.fine))
         if fit is None:
@@ -157,27 +157,26 @@ class Viewing:
         poses, options = hypotheses(search, self.options), self.options
         if not poses or description.grey is None:
             return None
-        own = [self.see(query, poses.pop(0))] if search.estimate is not None else []  # which keypoints have refined
-        if own and self._is_unseen(own[0].alike, own[0].world_from_camera):
-            return None
         places = [self._from(query, pose) for pose in poses]
+        own = []
+        if search.estimate is not None:  # which keypoints have refined
+            pose, (views, lacking) = poses.pop(0), places.pop(0)
+            own = [Seen(pose, compare_view(query, pose, views))]
+            if lacking and own[0].alike == 0:
+                return None
         rough = sorted(
-            (-compare_view(query, pose, place[: options.roughly], (0,)).alike, n)
-            for n, (pose, place) in enumerate(zip(poses, places, strict=True))
+            (-compare_view(query, pose, views[: options.roughly], (0,)).alike, n)
+            for n, (pose, (views, _)) in enumerate(zip(poses, places, strict=True))
         )  # about how alike, in a tenth of the time
-        unseen = sum(self._is_unseen(-alike, poses[n]) for alike, n in rough)
+        unseen = sum(alike == 0 and places[n][1] for alike, n in rough)
         chosen = [n for _, n in rough[: options.looked_at]]
-        seen = [Seen(poses[n], compare_view(query, poses[n], places[n])) for n in chosen]
+        seen = [Seen(poses[n], compare_view(query, poses[n], places[n][0])) for n in chosen]
         if not seen and not own:
             return None
         if any(one.alike >= options.worth_laying for one in seen):
             edges = image_edges(description.camera, description.grey)
             seen = [self._laid(query, edges, one) if one.alike >= options.worth_laying else one for one in seen]
         return replace(stand([*own, *seen], options), unseen=unseen)
-
-    def _is_unseen(self, alike: float, pose: FloatArray) -> bool:
-        """Whether that nothing is `alike` says nothing of a pose: keyframes that would show the place have no depth."""
-        return alike == 0 and self.cache.lacks_views(pose)
 
 
 def hypotheses(search: Search, options: ViewOptions) -> list[FloatArray]:

@@ -111,17 +111,14 @@ class Places:
     def __init__(self, bare: Sequence[float]) -> None:
         self._bare = bare
 
-    def views_seen_from(self, pose: FloatArray, query: SmallView, count: int) -> list[PlacedView]:
-        if self.lacks_views(pose):
-            return []
+    def views_seen_from(self, pose: FloatArray, query: SmallView, count: int) -> tuple[list[PlacedView], bool]:
+        if any(abs(pose[0, 3] - x) < 1 for x in self._bare):
+            return [], True
         depth = np.full(GREY.shape, 2.0, np.float32)
-        return [PlacedView(1, pose, small_view(SMALL, GREY, depth))]
+        return [PlacedView(1, pose, small_view(SMALL, GREY, depth))], False
 
     def edges_of(self, views: Sequence[PlacedView]) -> list[object]:
         return []
-
-    def lacks_views(self, pose: FloatArray) -> bool:
-        return any(abs(pose[0, 3] - x) < 1 for x in self._bare)
 
 
 def stood(bare: Sequence[float]) -> Standing | None:
