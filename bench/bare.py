@@ -9,15 +9,11 @@ that are no keyframes, by colour alone and with depth, and by every fourth of as
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
 from pathlib import Path
 
-import cv2
-
-from bench.visits import SAME, Answer, Place, Visit, evenly, make_map, rendered, show
+from bench.visits import SAME, Answer, Place, Visit, evenly, make_map, rendered, save, show, started
 from semdb.cli.options import load_settings
 from semdb.database.store import open_store
 from semdb.geometry import pose_error
@@ -73,14 +69,8 @@ def answers(
 def main(given: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--room", type=int, action="append", required=True, help="seed of a room")
-    parser.add_argument("--keyframes", type=int, default=12)
     parser.add_argument("--queries", type=int, default=24, help="of each room")
-    parser.add_argument("--work", type=Path, help="rooms and maps are kept here and found again")
-    parser.add_argument("--json", type=Path)
-    arguments = parser.parse_args(given)
-    cv2.setNumThreads(1)
-    known = arguments.json is not None and arguments.json.exists()
-    found = [Answer(**values) for values in json.loads(arguments.json.read_text())] if known else []
+    arguments, found = started(parser, given)
     settings = load_settings().model_copy(update={"detector": "recorded", "encoder": "gist"})
     with tempfile.TemporaryDirectory() as folder:
         work = arguments.work or Path(folder)
@@ -92,8 +82,7 @@ def main(given: Sequence[str] | None = None) -> None:
                 continue
             other = places[(number + 1) % len(places)] if len(places) > 1 else None
             found += answers(place, other, describer, settings, work)
-            if arguments.json is not None:
-                arguments.json.write_text(json.dumps([asdict(answer) for answer in found], indent=1) + "\n")
+            save(found, arguments.json)
         names = {place.name for place in places}
     show([answer for answer in found if answer.place in names])
 

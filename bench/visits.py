@@ -287,19 +287,30 @@ def show(found: Sequence[Answer]) -> None:
         print(f"| {cause} | {len(own)} | {len(sure) / len(own):.1%} | {false} | {middle} | {close:.1%} | {right:.1%} |")
 
 
-def main(given: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("recordings", nargs="*", type=Path)
-    parser.add_argument("--room", type=int, action="append", default=[], help="a rendered room, by number")
+def started(parser: argparse.ArgumentParser, given: Sequence[str] | None) -> tuple[argparse.Namespace, list[Answer]]:
+    """The arguments, with those of every bench of answers, and the answers that `--json` holds already."""
     parser.add_argument("--keyframes", type=int, default=12)
-    parser.add_argument("--queries", type=int, default=20, help="of each walk")
-    parser.add_argument("--causes", help="only these, separated by semicolons")
     parser.add_argument("--work", type=Path, help="rooms and maps are kept here and found again")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args(given)
     cv2.setNumThreads(1)
     known = arguments.json is not None and arguments.json.exists()
-    found = [Answer(**values) for values in json.loads(arguments.json.read_text())] if known else []
+    return arguments, [Answer(**values) for values in json.loads(arguments.json.read_text())] if known else []
+
+
+def save(found: Sequence[Answer], file: Path | None) -> None:
+    """Writes the answers, where a file is named."""
+    if file is not None:
+        file.write_text(json.dumps([asdict(answer) for answer in found], indent=1) + "\n")
+
+
+def main(given: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("recordings", nargs="*", type=Path)
+    parser.add_argument("--room", type=int, action="append", default=[], help="a rendered room, by number")
+    parser.add_argument("--queries", type=int, default=20, help="of each walk")
+    parser.add_argument("--causes", help="only these, separated by semicolons")
+    arguments, found = started(parser, given)
     with tempfile.TemporaryDirectory() as folder:
         work = arguments.work or Path(folder)
         work.mkdir(parents=True, exist_ok=True)
@@ -314,8 +325,7 @@ def main(given: Sequence[str] | None = None) -> None:
         for place, own in places:
             for some in answers(place, own, work, done, causes):
                 found += some
-                if arguments.json is not None:
-                    arguments.json.write_text(json.dumps([asdict(answer) for answer in found], indent=1) + "\n")
+                save(found, arguments.json)
         asked = {place.name for place, _ in places}
     show([answer for answer in found if answer.place in asked])
 

@@ -65,17 +65,10 @@ def training_parts(task: Task, *, keyframes_only: bool) -> tuple[Part, ...]:
         return task.keyframes
     if task.truth == REFINED:
         raise UsageError("networks on all frames need --truth given: only keyframes and queries have refined poses")
-    asked = {(part.recording.name, entry.index) for part in task.queries for entry in part.entries}
     parts = []
     for recording in dict.fromkeys(part.recording for part in task.keyframes):
-        entries = recording.entries
-        near = {
-            other
-            for position, entry in enumerate(entries)
-            if (recording.name, entry.index) in asked
-            for other in range(position - NEAR, position + NEAR + 1)
-        }
-        free = [e for position, e in enumerate(entries) if position not in near and e.world_from_camera is not None]
+        near = near_queries(task, recording)
+        free = [e for e in recording.entries if e.index not in near and e.world_from_camera is not None]
         parts.append(Part(recording, tuple(free)))
     if not any(part.entries for part in parts):
         raise UsageError(
@@ -83,6 +76,18 @@ def training_parts(task: Task, *, keyframes_only: bool) -> tuple[Part, ...]:
             "network on: ask fewer with --max-queries, or take a method NAME-keyframes"
         )
     return tuple(part for part in parts if part.entries)
+
+
+def near_queries(task: Task, recording: Recording) -> set[int]:
+    """Indexes of the frames of `recording` that are queries, and of the `NEAR` on each side of each."""
+    asked = {(part.recording.name, entry.index) for part in task.queries for entry in part.entries}
+    entries = recording.entries
+    return {
+        other.index
+        for position, entry in enumerate(entries)
+        if (recording.name, entry.index) in asked
+        for other in entries[max(0, position - NEAR) : position + NEAR + 1]
+    }
 
 
 class FrameReader:

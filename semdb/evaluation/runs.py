@@ -22,6 +22,7 @@ from semdb.evaluation.regression import (
     always,
     fixed_pose,
     keyframe_poses,
+    near_queries,
     regressed,
     trained_network,
 )
@@ -324,11 +325,8 @@ def _add_frames(info: MapInfo, task: Task, describer: Describer, store: Store, p
         raise UsageError(f"{SEMDB_FRAMES} needs --truth given: only keyframes and queries have refined poses")
     free = 0
     for part in task.keyframes:
-        name, order = part.recording.name, [entry.index for entry in part.recording.entries]
-        asked = {entry.index for other in task.queries if other.recording.name == name for entry in other.entries}
-        at = [n for n, index in enumerate(order) if index in asked]
-        near = {order[m] for n in at for m in range(max(0, n - NEAR), min(len(order), n + NEAR + 1))}
-        free += len(set(order) - near - {entry.index for entry in part.entries})
+        near = near_queries(task, part.recording)
+        free += len({e.index for e in part.recording.entries} - near - {e.index for e in part.entries})
         add_frames(store, info, part.recording, describer, without=near, progress=progress)
     if not free:
         raise UsageError(

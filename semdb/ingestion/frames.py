@@ -23,7 +23,8 @@ from semdb.ingestion.keyframes import MIN_OVERLAP, select_keyframes
 from semdb.ingestion.plan import fingerprint
 from semdb.perception.describe import Describer
 from semdb.recordings.base import FrameEntry, Recording
-from semdb.types import FloatArray, Frame, ImageArray, Keypoints
+from semdb.recordings.kept_images import as_jpeg
+from semdb.types import FloatArray, Frame, Keypoints
 
 JPEG_QUALITY = 92
 MOST_APART_M, MOST_APART_DEG = 0.1, 3.0  # that one keyframe may lie otherwise in the map than the recording says
@@ -181,8 +182,4 @@ def _row(
     on_nothing = np.full(len(keypoints), -1, np.int32)
     bare = Keypoints(keypoints.features, on_nothing, keypoints.points)
     grey = found.grey if found.grey is not None else np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY), np.uint8)
-    return [FrameRow(head, bare, _jpeg(grey))]
-
-
-def _jpeg(grey: ImageArray) -> bytes:
-    return bytes(cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1])
+    return [FrameRow(head, bare, as_jpeg(grey, JPEG_QUALITY))]

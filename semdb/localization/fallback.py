@@ -21,7 +21,7 @@ from semdb.localization.likeness import small_inverse_depth
 from semdb.localization.pose import PoseEstimate
 from semdb.localization.pose_options import PoseOptions
 from semdb.localization.shape_cache import ShapeCache
-from semdb.localization.verdict import Judgement, VerdictOptions
+from semdb.localization.verdict import Judgement, VerdictOptions, is_precise
 from semdb.localization.views import ClassNumbers, KeyframeView, View, make_view
 from semdb.perception.keypoints import find_keypoints
 from semdb.perception.protocols import FeatureExtractor
@@ -164,9 +164,8 @@ def weigh_fallback(
     metres, degrees = pose_error(before.world_from_camera, found.world_from_camera)
     looks_alike = alike.about >= options.least_alike and alike.in_all >= options.least_alike_in_all
     sure = judgement.confidence >= options.least_confidence and looks_alike
-    enough = anew.inliers >= bounds.localized_inliers and anew.spread >= bounds.minimum_spread
-    precise = anew.sigma_m <= bounds.maximum_translation_sigma_m and anew.sigma_deg <= bounds.maximum_rotation_sigma_deg
-    if not (sure and enough and precise and metres <= limit.metres and degrees <= limit.degrees):
+    enough = anew.inliers >= bounds.localized_inliers and is_precise(anew, bounds)
+    if not (sure and enough and metres <= limit.metres and degrees <= limit.degrees):
         return None
     return Judgement(Verdict.LOCALIZED, max(judgement.confidence, bounds.localized_confidence), judgement.reason)
 

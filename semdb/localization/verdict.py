@@ -84,6 +84,15 @@ def _first_support_is_enough(evidence: Evidence, options: VerdictOptions) -> boo
     return few or many
 
 
+def is_precise(evidence: Evidence, options: VerdictOptions) -> bool:
+    """Whether what agrees covers enough of the image to tell position and rotation as exactly as a verdict needs."""
+    return (
+        evidence.spread >= options.minimum_spread
+        and evidence.sigma_m <= options.maximum_translation_sigma_m
+        and evidence.sigma_deg <= options.maximum_rotation_sigma_deg
+    )
+
+
 def judge(evidence: Evidence | None, options: VerdictOptions) -> Judgement:
     """The verdict on a pose with this evidence, None where there is no pose."""
     if evidence is None or not _is_plausible(evidence, options):

@@ -14,6 +14,20 @@ SAME_DEPTH = 0.06  # share, by which a keyframe's own depth may differ from that
 
 
 @kernel
+def _in_other(u: Any, v: Any, d: Any, lens: Any, pose: Any, other: Any, of_other: Any) -> Any:
+    """Where the pixel `u`, `v` of one camera with depth `d` lies in another one: its pixel there, and its depth."""
+    k, m = pose, of_other
+    x, y = (u - lens[2]) / lens[0] * d, (v - lens[3]) / lens[1] * d
+    ox = k[0, 0] * x + k[0, 1] * y + k[0, 2] * d + k[0, 3] - m[0, 3]
+    oy = k[1, 0] * x + k[1, 1] * y + k[1, 2] * d + k[1, 3] - m[1, 3]
+    oz = k[2, 0] * x + k[2, 1] * y + k[2, 2] * d + k[2, 3] - m[2, 3]
+    z = m[0, 2] * ox + m[1, 2] * oy + m[2, 2] * oz
+    a = other[0] * (m[0, 0] * ox + m[1, 0] * oy + m[2, 0] * oz) / z + other[2]
+    b = other[1] * (m[0, 1] * ox + m[1, 1] * oy + m[2, 1] * oz) / z + other[3]
+    return a, b, z
+
+
+@kernel
 def splat(depth: Any, keyframe: Any, of_keyframe: Any, query: Any, of_query: Any, nearest: Any) -> None:
     """Lowers `nearest` ``[h, w]`` to the depth that a keyframe's pixels have, seen from a pose.
 
@@ -21,22 +35,13 @@ def splat(depth: Any, keyframe: Any, of_keyframe: Any, query: Any, of_query: Any
     distortion, `of_keyframe`, `of_query` ``[4, 4]`` poses in the world.
     """
     h, w = nearest.shape
-    k, m = of_keyframe, of_query
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
             d = depth[v, u]
             if not d > 0:
                 continue
-            x, y = (u - keyframe[2]) / keyframe[0] * d, (v - keyframe[3]) / keyframe[1] * d
-            ox = k[0, 0] * x + k[0, 1] * y + k[0, 2] * d + k[0, 3] - m[0, 3]
-            oy = k[1, 0] * x + k[1, 1] * y + k[1, 2] * d + k[1, 3] - m[1, 3]
-            oz = k[2, 0] * x + k[2, 1] * y + k[2, 2] * d + k[2, 3] - m[2, 3]
-            z = m[0, 2] * ox + m[1, 2] * oy + m[2, 2] * oz
-            if z < NEAREST_M:
-                continue
-            a = query[0] * (m[0, 0] * ox + m[1, 0] * oy + m[2, 0] * oz) / z + query[2]
-            b = query[1] * (m[0, 1] * ox + m[1, 1] * oy + m[2, 1] * oz) / z + query[3]
-            if not (-1.0 <= a < w + 1 and -1.0 <= b < h + 1):
+            a, b, z = _in_other(u, v, d, keyframe, of_keyframe, query, of_query)
+            if z < NEAREST_M or not (-1.0 <= a < w + 1 and -1.0 <= b < h + 1):
                 continue
             size = int(0.5 + 0.5 * d / z * query[0] / keyframe[0])
             size = min(size, MOST_FOOTPRINT)
@@ -56,23 +61,14 @@ def sample(
     """
     h, w = nearest.shape
     kh, kw = depth.shape
-    k, m = of_keyframe, of_query
     for v in range(h):
         for u in range(w):
             seen[v, u] = np.nan
             d = nearest[v, u]
             if not d < np.inf:
                 continue
-            x, y = (u - query[2]) / query[0] * d, (v - query[3]) / query[1] * d
-            ox = m[0, 0] * x + m[0, 1] * y + m[0, 2] * d + m[0, 3] - k[0, 3]
-            oy = m[1, 0] * x + m[1, 1] * y + m[1, 2] * d + m[1, 3] - k[1, 3]
-            oz = m[2, 0] * x + m[2, 1] * y + m[2, 2] * d + m[2, 3] - k[2, 3]
-            z = k[0, 2] * ox + k[1, 2] * oy + k[2, 2] * oz
-            if z < NEAREST_M:
-                continue
-            a = keyframe[0] * (k[0, 0] * ox + k[1, 0] * oy + k[2, 0] * oz) / z + keyframe[2]
-            b = keyframe[1] * (k[0, 1] * ox + k[1, 1] * oy + k[2, 1] * oz) / z + keyframe[3]
-            if not (0.0 <= a < kw - 1 and 0.0 <= b < kh - 1):
+            a, b, z = _in_other(u, v, d, query, of_query, keyframe, of_keyframe)
+            if z < NEAREST_M or not (0.0 <= a < kw - 1 and 0.0 <= b < kh - 1):
                 continue
             there = depth[int(b + 0.5), int(a + 0.5)]
             if not abs(there - z) < SAME_DEPTH * z:

@@ -16,7 +16,7 @@ from semdb.localization.pairs import join_pairs, world_points_of
 from semdb.localization.pose import robust_pnp
 from semdb.localization.predicted_view import ALIKE, PlacedView, SmallView, Windows, compare_view, small_view
 from semdb.localization.search import Search
-from semdb.localization.verdict import Judgement, VerdictOptions
+from semdb.localization.verdict import Judgement, VerdictOptions, is_precise
 from semdb.types import Description, FloatArray, Tolerance, Verdict
 
 LEAST_PAIRS = 8  # of a keyframe alone, for a pose of its own
@@ -216,12 +216,10 @@ def judge_seen(
 ) -> Judgement:
     """What becomes of a verdict of keypoints. `own` is whether the best pose is that of `evidence`."""
     best = standing.best
-    if own and evidence is not None and standing.is_sure(options):
-        enough = evidence.inliers >= options.least_inliers and evidence.spread >= bounds.minimum_spread
-        sure = evidence.sigma_m <= bounds.maximum_translation_sigma_m
-        if enough and sure and evidence.sigma_deg <= bounds.maximum_rotation_sigma_deg:
-            reason = f"{best.alike:.0%} of the image look as the map predicts, {evidence.inliers} keypoints agree"
-            return Judgement(Verdict.LOCALIZED, max(judgement.confidence, options.confidence), reason)
+    enough = evidence is not None and evidence.inliers >= options.least_inliers and is_precise(evidence, bounds)
+    if own and evidence is not None and enough and standing.is_sure(options):
+        reason = f"{best.alike:.0%} of the image look as the map predicts, {evidence.inliers} keypoints agree"
+        return Judgement(Verdict.LOCALIZED, max(judgement.confidence, options.confidence), reason)
     if judgement.verdict is not Verdict.LOCALIZED:
         return judgement
     if own and not standing.unbeaten:

@@ -26,12 +26,13 @@ def kept_images(rgb: bytes, depth: bytes | None, keep: str, name: str) -> tuple[
     if keep == JPEG:
         if header.kind == "jpeg":
             return rgb, depth
-        return min(rgb, _jpeg(decode_color(rgb, name)[:, :, ::-1], JPEG_QUALITY), key=len), depth
+        return min(rgb, as_jpeg(decode_color(rgb, name)[:, :, ::-1], JPEG_QUALITY), key=len), depth
     if header.kind == "jpeg" and header.channels == 1:
         return rgb, None
-    return min(rgb, _jpeg(decode_color_grey(rgb, name), GREY_QUALITY), key=len), None
+    return min(rgb, as_jpeg(decode_color_grey(rgb, name), GREY_QUALITY), key=len), None
 
 
-def _jpeg(pixels: ImageArray, quality: int) -> bytes:
+def as_jpeg(pixels: ImageArray, quality: int) -> bytes:
+    """An image ``[H, W]`` or ``[H, W, 3]`` (BGR), uint8, as a JPEG file."""
     _, data = cv2.imencode(".jpg", np.ascontiguousarray(pixels), [cv2.IMWRITE_JPEG_QUALITY, quality])
     return bytes(data)
