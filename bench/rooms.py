@@ -25,7 +25,7 @@ from semdb.database.store import Store, open_store
 from semdb.geometry import pose_distances, pose_error
 from semdb.localization.coarse import CoarseOptions, Scoring
 from semdb.localization.images import make_localizer
-from semdb.localization.localizer import LocalizerOptions
+from semdb.localization.localizer_options import LocalizerOptions
 from semdb.perception.describe import Describer
 from semdb.perception.detectors.recorded import RecordedDetector
 from semdb.perception.encoders.gist import GistEncoder

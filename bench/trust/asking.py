@@ -14,7 +14,8 @@ from semdb.database.store import Store
 from semdb.evaluation.workspace import evaluation_store
 from semdb.ingestion.run import IngestOptions, ingest_recording
 from semdb.localization.images import make_localizer
-from semdb.localization.localizer import Localizer, LocalizerOptions
+from semdb.localization.localizer import Localizer
+from semdb.localization.localizer_options import LocalizerOptions
 from semdb.localization.verdict import VerdictOptions
 from semdb.perception.describe import Describer, describer_from_specs
 from semdb.perception.model_choice import specs_for_ingest

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 from semdb.errors import UsageError
 from semdb.localization.coarse import CoarseOptions, Scoring
-from semdb.localization.localizer import LocalizerOptions
+from semdb.localization.localizer_options import LocalizerOptions
 from semdb.localization.matching import Evidence, MatchingOptions
 from semdb.localization.pose_options import PoseOptions
 from semdb.localization.verdict import VerdictOptions

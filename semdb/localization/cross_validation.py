@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from semdb.geometry import pose_offset
-from semdb.localization.localizer import LocalizerOptions
+from semdb.localization.localizer_options import LocalizerOptions
 from semdb.localization.pose import estimate_pose, first_pose, match_views
 from semdb.localization.recorded_errors import LeftOut
 from semdb.localization.verdict import convinces

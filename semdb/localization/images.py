@@ -14,7 +14,8 @@ from semdb.localization.fallback import Fallback
 from semdb.localization.index import IndexOptions, IndexSource, MapIndex
 from semdb.localization.keyframe_cache import STALE, KeyframeCache
 from semdb.localization.learned_matching import is_learned
-from semdb.localization.localizer import Localizer, LocalizerOptions
+from semdb.localization.localizer import Localizer
+from semdb.localization.localizer_options import LocalizerOptions
 from semdb.localization.query_image import QueryImage
 from semdb.localization.sources import SqlSource
 from semdb.perception.model_choice import dynamic_classes

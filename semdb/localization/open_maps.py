@@ -13,7 +13,8 @@ from semdb.errors import CodecError, ModelError, NotFoundError, ProvenanceError,
 from semdb.localization.coarse import CoarseSource
 from semdb.localization.images import ImageLocalization, check_coarse, localizer_on, open_index
 from semdb.localization.index import IndexSource, MapIndex
-from semdb.localization.localizer import Localizer, LocalizerOptions
+from semdb.localization.localizer import Localizer
+from semdb.localization.localizer_options import LocalizerOptions
 from semdb.localization.query_image import QueryImage, at_scale
 from semdb.localization.query_scale import times_finer
 from semdb.localization.shared import SharedSource

@@ -20,7 +20,7 @@ from semdb.geometry import pose_distances, pose_error
 from semdb.geometry.volumes import Volume, volume_of
 from semdb.localization.images import localizer_on
 from semdb.localization.index import IndexSource, MapIndex
-from semdb.localization.localizer import LocalizerOptions
+from semdb.localization.localizer_options import LocalizerOptions
 from semdb.localization.stored_query import stored_queries
 from semdb.refinement.align_report import AlignedKeyframe, AlignReport
 from semdb.settings import Settings

@@ -125,7 +125,7 @@ def errors_at(
     Raises CodecError where models of the map are damaged.
     """
     from semdb.localization.cross_validation import localized_among
-    from semdb.localization.localizer import LocalizerOptions
+    from semdb.localization.localizer_options import LocalizerOptions
 
     known, poses = cache.poses()
     if keyframe_id not in known:

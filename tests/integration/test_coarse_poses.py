@@ -11,7 +11,7 @@ import pytest
 from semdb.database.store import open_store
 from semdb.geometry import pose_error
 from semdb.localization.images import make_localizer
-from semdb.localization.localizer import LocalizerOptions
+from semdb.localization.localizer_options import LocalizerOptions
 from semdb.perception.objects import take_features
 from semdb.refinement.run import refine_map
 from semdb.types import Description, Keypoints, Verdict

@@ -19,7 +19,8 @@ from semdb.localization.coarse import Batch, Proposal, Stage
 from semdb.localization.confidence import Evidence
 from semdb.localization.fallback import Fallback, FallbackOptions, asked_first, weigh_alone, weigh_fallback
 from semdb.localization.images import fallback_of, make_localizer
-from semdb.localization.localizer import Localizer, LocalizerOptions
+from semdb.localization.localizer import Localizer
+from semdb.localization.localizer_options import LocalizerOptions
 from semdb.localization.pose import PoseEstimate
 from semdb.localization.verdict import Judgement, VerdictOptions
 from semdb.perception.describe import describer_from_specs
@@ -154,8 +155,9 @@ def test_both_features_have_to_be_sure_together(room: Path, url: str) -> None:
     description, _ = described(room, 4)
     asked = localizer(url, Counting())
     search = asked._search(description, None)
-    asked._try(search, Batch(Stage.ALL, tuple(Proposal(i, 0.0, 0.0) for i in asked.cache.poses()[0][:3]), 3))
-    _, judgement, evidence = asked._settle(search)
+    asked.fine.ask(search, Batch(Stage.ALL, tuple(Proposal(i, 0.0, 0.0) for i in asked.cache.poses()[0][:3]), 3))
+    settled = asked.fine.settle(search)
+    judgement, evidence = settled.judgement, settled.evidence
     own = search.estimate
     assert evidence is not None
     assert own is not None

@@ -19,7 +19,8 @@ from semdb.evaluation.runner import EvaluateOptions, evaluate
 from semdb.geometry import pose_error
 from semdb.ingestion.frames import add_frames
 from semdb.localization.images import make_localizer
-from semdb.localization.localizer import Localizer, LocalizerOptions
+from semdb.localization.localizer import Localizer
+from semdb.localization.localizer_options import LocalizerOptions
 from semdb.perception.describe import Describer, describer_from_specs
 from semdb.recordings import open_recording
 from semdb.settings import Settings

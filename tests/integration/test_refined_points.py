@@ -23,7 +23,7 @@ from semdb.geometry import pose_from, so3_exp
 from semdb.localization.coarse import MapChange
 from semdb.localization.images import make_localizer
 from semdb.localization.keyframe_cache import KeyframeCache
-from semdb.localization.localizer import LocalizerOptions
+from semdb.localization.localizer_options import LocalizerOptions
 from semdb.localization.open_maps import OpenMaps
 from semdb.refinement import error_step
 from semdb.refinement.run import refine_map

@@ -16,7 +16,7 @@ from semdb.localization.alike import Alike, LearnedVerdictOptions, weigh_learned
 from semdb.localization.confidence import Evidence as PoseEvidence
 from semdb.localization.images import fallback_of
 from semdb.localization.learned_matching import for_learned, is_learned, match_by
-from semdb.localization.localizer import LocalizerOptions
+from semdb.localization.localizer_options import LocalizerOptions
 from semdb.localization.matching import Evidence, MatchingOptions, match_keypoints
 from semdb.localization.verdict import Judgement
 from semdb.localization.views import ClassNumbers, View, make_view

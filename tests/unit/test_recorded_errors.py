@@ -10,7 +10,7 @@ import pytest
 
 from semdb.geometry import pose_distances, pose_from, pose_offset, so3_exp
 from semdb.localization.cross_validation import localized_among
-from semdb.localization.localizer import LocalizerOptions
+from semdb.localization.localizer_options import LocalizerOptions
 from semdb.localization.pose import estimate_pose, match_views, recorded_covariance
 from semdb.localization.recorded_errors import (
     MODEL,

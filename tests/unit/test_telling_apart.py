@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 from semdb.localization.coarse import Proposal
-from semdb.localization.localizer import Localizer, LocalizerOptions
+from semdb.localization.fine_step import FineStep
+from semdb.localization.localizer_options import LocalizerOptions
 from semdb.localization.pose import estimate_pose, match_views
 from semdb.localization.predicted_view import PlacedView, SmallView, Windows, small_view
 from semdb.localization.search import Search, evidence_of
+from semdb.localization.telling_apart import tell_apart
 from semdb.localization.verdict import Judgement
 from semdb.localization.view_step import Seen, Standing, Viewing, ViewOptions
 from semdb.localization.views import ClassNumbers
@@ -71,10 +73,9 @@ def tell(points: int, standing: Standing, accept: Tolerance | None = None) -> tu
     assert found is not None
     search.estimate = replace(found, world_from_camera=shifted(5.0))
     evidence = replace(evidence_of(search, found, 0), agreement=0.3, first_of_best=10, likeness=0.5)
-    localizer = Localizer.__new__(Localizer)
-    localizer.options, localizer.cache = options, cast(Any, NoNeighbours())
-    localizer.viewing = Told(cast(Any, None), ViewOptions(), standing)
-    judgement, _ = localizer._tell_apart(search, cast(Any, None), WEAK, evidence)
+    fine = FineStep(cast(Any, NoNeighbours()), (), options)
+    viewing = Told(cast(Any, None), ViewOptions(), standing)
+    judgement, _ = tell_apart(fine, viewing, search, cast(Any, None), WEAK, evidence)
     return search, judgement
 
 

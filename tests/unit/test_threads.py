@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from semdb.localization.localizer import LocalizerOptions
+from semdb.localization.localizer_options import LocalizerOptions
 from semdb.localization.pose import estimate_pose, match_views
 from semdb.localization.pose_options import PoseOptions
 from semdb.localization.views import ClassNumbers
