@@ -1,8 +1,10 @@
 """Tracking against single images: accuracy, jitter, honesty, cost; kidnapping and blackouts.
 
-``python -m bench.tracking RECORDING... [--stride N] [--frames N] [--json FILE]``. Every N-th frame is a keyframe, all
-others are tracked in their order, and localized one by one beside. Costs are without networks: local features and all
-after them, of the same run. Kidnapped: the camera jumps over a third of the recording, and ten frames of the next
+``python -m bench.tracking RECORDING... [--stride N] [--frames N] [--truth refined] [--json FILE]``. Every N-th frame is
+a keyframe, all others are tracked in their order, and each is localized beside it. Costs are without networks: local
+features and all after them, of the same run; `cpu` is processor time. With ``--truth refined`` keyframes and truth have
+the poses that structure from motion gives, as with ``semdb evaluate``: those of the recordings differ from their images
+by more than steps do. Kidnapped: the camera jumps over a third of the recording, and ten frames of the next
 recording named (or of a rendered room) come in between; a frame is wrong when its state is ``tracking`` and it is more
 than 0.25 m or 5 degrees off, or shows the other place. Blackout: three seconds of black images while time goes on.
 Models are those of the settings (``SEMDB_DETECTOR``, ``SEMDB_ENCODER``).
@@ -14,6 +16,7 @@ import argparse
 import itertools
 import json
 import tempfile
+import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -26,6 +29,8 @@ import semdb
 from semdb.api import Database
 from semdb.api.tracking import smooth_answers
 from semdb.door.tracked import Tracked
+from semdb.evaluation.protocols import SPLIT
+from semdb.evaluation.tasks import GIVEN, REFINED, Part, Task, refine_truth
 from semdb.geometry import invert_pose, pose_error
 from semdb.recordings import Recording, open_recording
 from semdb.recordings.synthetic import SyntheticOptions, write_synthetic_recording
@@ -46,6 +51,7 @@ class Row:
     covariance: FloatArray | None
     truth: FloatArray
     ms: float
+    cpu_ms: float = float("nan")
 
 
 def main() -> None:
@@ -53,6 +59,7 @@ def main() -> None:
     parser.add_argument("recordings", nargs="+", type=Path)
     parser.add_argument("--stride", type=int, default=5)
     parser.add_argument("--frames", type=int, help="at most so many of each recording")
+    parser.add_argument("--truth", choices=(GIVEN, REFINED), default=GIVEN)
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     results = {}
@@ -60,12 +67,22 @@ def main() -> None:
         for number, path in enumerate(given.recordings):
             others = [p for p in given.recordings if p != path]
             foreign = others[number % len(others)] if others else rendered(Path(folder) / "room")
-            recording = open_recording(path)
+            recording = with_truth(open_recording(path), given.truth)
             with semdb.open(f"sqlite:///{folder}/{number}.sqlite3") as database:
-                results[recording.name] = measure(database, path, given.stride, given.frames, foreign)
+                results[recording.name] = measure(database, recording, given.stride, given.frames, foreign)
             show(recording.name, results[recording.name])
     if given.json:
         given.json.write_text(json.dumps(results, indent=2))
+
+
+def with_truth(recording: Recording, truth: str) -> Recording:
+    """The recording with refined poses and without frames that have none, where these are asked for."""
+    if truth == GIVEN:
+        return recording
+    part = Part(recording, tuple(entry for entry in recording.entries if entry.world_from_camera is not None))
+    task = Task(recording.name, SPLIT, (part,), (), len(part.entries))
+    [better] = refine_truth(task, both=False, progress=None)
+    return replace(recording, entries=better.keyframes[0].entries)
 
 
 def rendered(folder: Path) -> Path:
@@ -73,28 +90,37 @@ def rendered(folder: Path) -> Path:
     return folder
 
 
-def measure(database: Database, path: Path, stride: int, most: int | None, foreign: Path) -> dict[str, Any]:
+def measure(database: Database, recording: Recording, stride: int, most: int | None, foreign: Path) -> dict[str, Any]:
     """All parts of one recording."""
-    database.ingest(path, map="tracked", stride=stride)
-    recording = open_recording(path)
+    database.ingest(recording, map="tracked", stride=stride)
     entries = recording.entries[:most]
     times_s, _ = times_of(entries)
     frames = [
         frame_of(recording, number, round(times_s[number] * 1e9)) for number in range(len(entries)) if number % stride
     ]
-    single = [one_by_one(database, frame) for frame in frames]
-    tracker = database.tracker("tracked")
-    answers = [tracker.update(frame) for frame in frames]
+    single, answers, cpu_ms = beside(database, frames)
     again = database.tracker("tracked")
     smooth = list(smooth_answers((again.update(frame) for frame in frames), again))
     return {
         "single": scores(single),
-        "tracked": scores(rows_of(answers, frames)),
+        "tracked": scores(rows_of(answers, frames, cpu_ms)),
         "smoothed": scores(rows_of(smooth, frames)),
         "states": Counter(str(answer.state) for answer in answers),
         "kidnapped": kidnapped(database, frames, open_recording(foreign)),
         "blackout": blackout(database, frames),
     }
+
+
+def beside(database: Database, frames: Sequence[Frame]) -> tuple[list[Row], list[Tracked], list[float]]:
+    """Each frame as a single image and tracked, in turn, so that what else the machine does meets both alike."""
+    tracker = database.tracker("tracked")
+    single, answers, cpu_ms = [], [], []
+    for frame in frames:
+        single.append(one_by_one(database, frame))
+        started = time.process_time()
+        answers.append(tracker.update(frame))
+        cpu_ms.append((time.process_time() - started) * 1000)
+    return single, answers, cpu_ms
 
 
 def frame_of(recording: Recording, number: int, time_ns: int) -> Frame:
@@ -125,10 +151,11 @@ def truth_of(frame: Frame) -> FloatArray:
     return frame.world_from_camera
 
 
-def rows_of(answers: Sequence[Tracked], frames: Sequence[Frame]) -> list[Row]:
+def rows_of(answers: Sequence[Tracked], frames: Sequence[Frame], cpu_ms: Sequence[float] | None = None) -> list[Row]:
+    spent = cpu_ms or [float("nan")] * len(frames)
     return [
-        Row(a.world_from_camera if a.tracking else None, a.covariance, truth_of(f), a.latency_ms)
-        for a, f in zip(answers, frames, strict=True)
+        Row(a.world_from_camera if a.tracking else None, a.covariance, truth_of(f), a.latency_ms, ms)
+        for a, f, ms in zip(answers, frames, spent, strict=True)
     ]
 
 
@@ -145,7 +172,7 @@ def scores(rows: Sequence[Row]) -> dict[str, float]:
             if a.pose is not None and b.pose is not None
         ]
     ).reshape(-1, 2)
-    ms = np.array([row.ms for row in rows])
+    ms, cpu_ms = np.array([row.ms for row in rows]), np.array([row.cpu_ms for row in rows])
     return {
         "share": len(found) / len(rows),
         "median_m": float(np.median(errors[:, 0])),
@@ -154,9 +181,12 @@ def scores(rows: Sequence[Row]) -> dict[str, float]:
         "step_m": float(np.median(steps[:, 0])),
         "step_deg": float(np.median(steps[:, 1])),
         "step_p99_m": float(np.percentile(steps[:, 0], 99)),
+        "p99_deg": float(np.percentile(errors[:, 1], 99)),
         "nees": float(np.median([nees(row) for row in found])),
         "ms": float(np.median(ms)),
         "p95_ms": float(np.percentile(ms, 95)),
+        "cpu_ms": float(np.median(cpu_ms)),
+        "cpu_p95_ms": float(np.percentile(cpu_ms, 95)),
     }
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from semdb.types import BoolArray, Float32Array, FloatArray, IntArray
 BACKGROUND = -1
 NOTHING = -1e30  # what is less close is not there
 NO_PRODUCT = -32768  # the same of products of bytes
+SMALL = 4096  # numbers of classes up to here are counted, not sorted
 
 
 class Evidence(StrEnum):
@@ -110,9 +112,18 @@ def closeness(first: npt.NDArray[np.generic], second: npt.NDArray[np.generic]) -
 def distance_of(close: npt.NDArray[Any], dtype: np.dtype[np.generic]) -> Float32Array:
     """The distance that goes with `closeness`: squared Euclidean of unit vectors, Hamming of bits; inf for none."""
     if dtype == np.int8:
-        return np.asarray(np.where(close == NO_PRODUCT, np.inf, _distance_of_products(close)), np.float32)
+        return np.asarray(_distances_of_products()[close], np.float32)
     distance = -close if dtype == np.uint8 else np.maximum(2 - 2 * close, 0)
     return np.asarray(np.where(close < NOTHING, np.inf, distance), np.float32)
+
+
+@cache
+def _distances_of_products() -> Float32Array:
+    """The distance of every int16 product ``[65536]``, negative ones counted from the end; inf of `NO_PRODUCT`."""
+    products = np.arange(2**16, dtype=np.uint16).view(np.int16)
+    found = _distance_of_products(products)
+    found[NO_PRODUCT] = np.inf
+    return found
 
 
 def _distance_of_products(product: npt.NDArray[Any]) -> Float32Array:
@@ -187,7 +198,7 @@ def match_keypoints(
             np.zeros(len(keyframe_descriptors), np.int8),
         )
     found = []
-    for sign in np.intersect1d(query_signs, keyframe_signs):
+    for sign in _in_both(query_signs, keyframe_signs):
         rows = np.flatnonzero(query_signs == sign).astype(np.int32)
         columns = np.flatnonzero(keyframe_signs == sign).astype(np.int32)
         here = _match_block(
@@ -199,6 +210,17 @@ def match_keypoints(
         )
         found.append(Matches(rows[here.query], columns[here.keyframe], here.distance, here.same_class))
     return _sorted(found)
+
+
+def _in_both(first: IntArray | npt.NDArray[np.int8], second: IntArray | npt.NDArray[np.int8]) -> list[int]:
+    """The numbers that two arrays share, ascending; faster than by sorting where they are small and not below -1."""
+    if not len(first) or not len(second):
+        return []
+    if min(first.min(), second.min()) < -1 or max(first.max(), second.max()) > SMALL:
+        return [int(number) for number in np.intersect1d(first, second)]
+    size = int(max(first.max(), second.max())) + 2
+    there = [np.bincount(np.asarray(numbers, np.intp) + 1, minlength=size) > 0 for numbers in (first, second)]
+    return [int(number) - 1 for number in np.flatnonzero(there[0] & there[1])]
 
 
 def _match_block(
@@ -220,7 +242,7 @@ def _match_block(
         keep = pairs.passing(np.where(contradicts, options.contradiction_ratio, options.ratio) ** power, ceiling)
         found.append((pairs.rows[keep], pairs.columns[keep]))
         taken_query[pairs.rows[keep]] = taken_keyframe[pairs.columns[keep]] = True
-    for category in np.intersect1d(query_classes, keyframe_classes):
+    for category in _in_both(query_classes, keyframe_classes):
         if category == BACKGROUND:
             continue
         rows = np.flatnonzero(query_classes == category).astype(np.int32)

@@ -207,15 +207,29 @@ def _add_byte_rows(first: Any, second: Any, start: int, stop: int, k: int, out: 
 
 @kernel
 def scan_bytes(closeness: Any, nearest: Any, best: Any, second: Any, best_back: Any) -> None:
-    """`scan_all` of int16 products; without a second it is -32768."""
-    best_back[:] = -32768
+    """`scan_all` of int16 products; without a second it is -32768.
+
+    Loops are in functions of their own, and without branches, so that each is vectorised.
+    """
+    least, columns = np.int16(-32768), closeness.shape[1]
+    best_back[:] = least
+    blocks = (columns + BLOCK - 1) // BLOCK
+    tops = np.empty(blocks, np.int16)  # the greatest of each block: the second greatest needs no second pass
     for i in range(closeness.shape[0]):
         line = closeness[i]
-        greatest = _greatest(line, best_back)
-        at = 0
-        while at + 1 < len(line) and line[at] < greatest:
+        for block in range(blocks):
+            here = slice(block * BLOCK, min(columns, (block + 1) * BLOCK))
+            tops[block] = _greatest(line[here], best_back[here])
+        greatest = _top(tops)
+        first = 0
+        while tops[first] < greatest:
+            first += 1
+        start, stop = first * BLOCK, min(columns, (first + 1) * BLOCK)
+        at = start
+        while line[at] < greatest:
             at += 1
-        nearest[i], best[i], second[i] = at, greatest, _following(line, greatest)
+        tops[first] = max(_top(line[start:at]), _top(line[at + 1 : stop]))
+        nearest[i], best[i], second[i] = at, greatest, _top(tops)
 
 
 @kernel
@@ -229,16 +243,11 @@ def _greatest(line: Any, best_back: Any) -> Any:
 
 
 @kernel
-def _following(line: Any, greatest: Any) -> Any:
-    """The second greatest; loops without branches, so that each is vectorised."""
-    least = np.int16(-32768)
-    following, equal = least, np.int16(0)
+def _top(line: Any) -> Any:
+    greatest = np.int16(-32768)
     for j in range(len(line)):
-        value = line[j]
-        following = max(following, value if value < greatest else least)
-    for j in range(len(line)):
-        equal += np.int16(line[j] == greatest)
-    return following if equal == 1 else greatest
+        greatest = max(greatest, line[j])
+    return greatest
 
 
 @kernel
