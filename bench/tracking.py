@@ -33,6 +33,7 @@ from semdb.evaluation.protocols import SPLIT
 from semdb.evaluation.tasks import GIVEN, REFINED, Part, Task, refine_truth
 from semdb.geometry import invert_pose, pose_error
 from semdb.recordings import Recording, open_recording
+from semdb.recordings.base import FrameEntry
 from semdb.recordings.synthetic import SyntheticOptions, write_synthetic_recording
 from semdb.trajectory.recording import times_of
 from semdb.types import FloatArray, Frame
@@ -60,6 +61,7 @@ def main() -> None:
     parser.add_argument("--stride", type=int, default=5)
     parser.add_argument("--frames", type=int, help="at most so many of each recording")
     parser.add_argument("--truth", choices=(GIVEN, REFINED), default=GIVEN)
+    parser.add_argument("--poses", type=Path, help="folder that keeps refined poses for the next run")
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     results = {}
@@ -67,7 +69,7 @@ def main() -> None:
         for number, path in enumerate(given.recordings):
             others = [p for p in given.recordings if p != path]
             foreign = others[number % len(others)] if others else rendered(Path(folder) / "room")
-            recording = with_truth(open_recording(path), given.truth)
+            recording = with_truth(open_recording(path), given.truth, given.poses)
             with semdb.open(f"sqlite:///{folder}/{number}.sqlite3") as database:
                 results[recording.name] = measure(database, recording, given.stride, given.frames, foreign)
             show(recording.name, results[recording.name])
@@ -75,14 +77,23 @@ def main() -> None:
         given.json.write_text(json.dumps(results, indent=2))
 
 
-def with_truth(recording: Recording, truth: str) -> Recording:
+def with_truth(recording: Recording, truth: str, kept: Path | None) -> Recording:
     """The recording with refined poses and without frames that have none, where these are asked for."""
     if truth == GIVEN:
         return recording
+    file = None if kept is None else kept / f"refined_{recording.path.name}.npz"
+    if file is not None and file.exists():
+        with np.load(file) as known:
+            poses = dict(zip(known["index"].tolist(), known["pose"], strict=True))
+        entries = [replace(e, world_from_camera=poses[e.index]) for e in recording.entries if e.index in poses]
+        return replace(recording, entries=tuple(entries))
     part = Part(recording, tuple(entry for entry in recording.entries if entry.world_from_camera is not None))
     task = Task(recording.name, SPLIT, (part,), (), len(part.entries))
     [better] = refine_truth(task, both=False, progress=None)
-    return replace(recording, entries=better.keyframes[0].entries)
+    found = better.keyframes[0].entries
+    if file is not None:
+        np.savez(file, index=[e.index for e in found], pose=np.stack([truth_of(e) for e in found]))
+    return replace(recording, entries=found)
 
 
 def rendered(folder: Path) -> Path:
@@ -145,7 +156,7 @@ def one_by_one(database: Database, frame: Frame) -> Row:
     return Row(pose, answer.covariance, truth_of(frame), spent)
 
 
-def truth_of(frame: Frame) -> FloatArray:
+def truth_of(frame: Frame | FrameEntry) -> FloatArray:
     if frame.world_from_camera is None:
         raise ValueError(f"{frame.name} has no pose to be compared with")
     return frame.world_from_camera

@@ -30,6 +30,7 @@ class BlurOptions:
     """Where keypoints do not convince and motion has blurred the query."""
 
     keyframes: int = 5  # that are blurred alike
+    least_peak: float = 0.12  # of `motion_blur`: less than to be told of, since what is not there gains no keypoints
     hessian_threshold: float = 15.0  # of SURF, on both images: blurred ones have little contrast
 
 

@@ -71,7 +71,7 @@ class FineStep:
         if options is None or description.grey is None or not search.keyframes:
             return
         started = time.perf_counter()
-        extractor, blur = extractor_for(self.models, options), motion_blur(description.grey)
+        extractor, blur = extractor_for(self.models, options), motion_blur(description.grey, options.least_peak)
         if extractor is None or blur is None:
             return
         query = blurred_query(description, description.grey, extractor, self.cache.numbers)

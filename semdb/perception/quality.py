@@ -71,8 +71,11 @@ def sharpness_of(grey: ImageArray) -> float:
     return float(cv2.norm(x, cv2.NORM_L2SQR) + cv2.norm(y, cv2.NORM_L2SQR)) / max(grey.size, 1)
 
 
-def motion_blur(grey: ImageArray) -> tuple[float, float] | None:
-    """Length (pixels) and direction (degrees from x towards y, 0 to 180) of motion blur; None where there is none."""
+def motion_blur(grey: ImageArray, least_peak: float = LEAST_PEAK) -> tuple[float, float] | None:
+    """Length (pixels) and direction (degrees from x towards y, 0 to 180) of motion blur; None where there is none.
+
+    `least_peak` is how far it has to stand out: plain images have little that could show it.
+    """
     if min(grey.shape) < SMALLEST:
         return None
     cepstrum = _cepstrum(grey.astype(np.float32))
@@ -81,7 +84,7 @@ def motion_blur(grey: ImageArray) -> tuple[float, float] | None:
     at = int(np.argmin(np.where(radius > 0, values, np.inf)))
     middle, spread = _ring_statistics(values, rings[int(radius[at])])
     peak = -float(values[at])
-    if not spread > 0 or peak * (peak + middle) / spread < LEAST_PEAK:
+    if not spread > 0 or peak * (peak + middle) / spread < least_peak:
         return None
     y, x = _finest(cepstrum, *divmod(at, BLOCK))
     return float(np.hypot(x, y)), float(np.degrees(np.arctan2(y, x)) % 180)

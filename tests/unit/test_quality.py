@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from semdb.localization.blurred import BlurOptions
 from semdb.perception.quality import (
     blurred_like,
     complaint_of,
@@ -48,6 +49,24 @@ def test_no_motion_is_found_where_there_is_none(seed: int) -> None:
     noise = np.random.default_rng(seed).integers(0, 256, (480, 640)).astype(np.uint8)
     assert motion_blur(noise) is None
     assert motion_blur(scene(seed)[:120]) is None  # too small to say
+
+
+@pytest.mark.parametrize("seed", [1, 2, 6, 9])
+def test_motion_that_plain_images_hardly_show_is_looked_for_but_not_told_of(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    image = np.full((480, 640), 150, np.uint8)
+    for _ in range(60):
+        x, y = rng.integers(0, 640), rng.integers(0, 480)
+        size = int(rng.integers(10, 120))
+        points = np.array([x, y]) + rng.integers(-size, size + 1, (5, 2))
+        cv2.fillPoly(image, [points.astype(np.int32)], int(rng.integers(110, 190)))
+    sharp = cv2.GaussianBlur(image, (0, 0), 0.7)
+    noise = np.random.default_rng(seed).normal(0, 1, image.shape)
+    moved, still = (np.clip(seen + noise, 0, 255).astype(np.uint8) for seen in (blurred_like(sharp, (23, 45.0)), sharp))
+    least = BlurOptions().least_peak
+    assert motion_blur(moved) is None
+    assert motion_blur(moved, least) == (pytest.approx(23, abs=1), pytest.approx(45, abs=3))
+    assert motion_blur(still, least) is None
 
 
 def test_motion_is_found_in_small_images() -> None:
