@@ -97,7 +97,9 @@ def bundle_adjust(
         looser=observed[:, 5],
         keyframe_sigma=_pose_sigmas(keyframes),
     )
-    return adjust(problem, camera_from_world, options.motion, rough=alignment is None, start=start)
+    return adjust(
+        problem, camera_from_world, options.motion, rough=alignment is None, start=start, evident=options.evident
+    )
 
 
 def _pose_sigmas(keyframes: Sequence[KeyframeView]) -> FloatArray | None:

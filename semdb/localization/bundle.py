@@ -127,6 +127,7 @@ class _Solver:
         bounds = np.arange(len(problem.points) + 1)
         self.first = np.searchsorted(problem.observed_point, bounds).astype(np.int32)
         self.images = len(problem.keyframe_from_world) + 1
+        self.diagonal = np.arange(9 * self.images)
         self.information = np.zeros((self.images, 9))  # of the priors
         self.drift = np.ones((self.images, 9))  # how many times the priors' sigma each unknown has
         self.expected = np.zeros((self.images, 9))  # by the priors
@@ -213,7 +214,7 @@ class _Solver:
         for c in range(self.images):
             own = slice(9 * c, 9 * c + 9)
             matrix[own, own] = blocks.images[c]
-        matrix[np.arange(size), np.arange(size)] *= 1 + damping
+        matrix[self.diagonal, self.diagonal] *= 1 + damping
         gradient = blocks.image_gradients.reshape(-1).copy()
         reduce_to_images(
             blocks.coupling, blocks.points, blocks.point_gradients, self.first, self.problem.observed_image,
@@ -259,6 +260,7 @@ def adjust(
     *,
     rough: bool = False,
     start: BundleResult | None = None,
+    evident: bool = True,
 ) -> BundleResult:
     """Minimises equation (5) from `camera_from_world` ``[4, 4]``, or from where `start` left the same images.
 
@@ -266,7 +268,7 @@ def adjust(
     the variance of each of these priors is what the solution shows it to be (MacKay's evidence approximation, Neural
     Computation 4(3), 1992). So where nothing turned, no freedom is given that noise would use.
     The query's depth joins the second time, as far as it agrees with the first solution. `rough` stops after the first,
-    without a covariance.
+    without a covariance. Without `evident` nothing is said of how far the keyframes' poses are off.
     Raises numpy.linalg.LinAlgError when the points do not determine the pose (fewer than three, or in a row).
     """
     prior = prior or MotionPrior()
@@ -287,14 +289,14 @@ def adjust(
         return _result(state, blocks, iterations, None)
     solver.believe_depth(state)
     sigma, freedom = _evident_sigma(solver, state, blocks, least, greatest)
-    evident = _evident_errors(solver, state, blocks, sigma, freedom, least, greatest)
+    errors = _evident_errors(solver, state, blocks, sigma, freedom, least, greatest) if evident else None
     solver.believe(sigma)
     state, blocks, more = solver.minimise(state, max_iterations)
     shown = 1 - (least / np.maximum(sigma, FIXED)) ** 2  # what is least is not known to be there at all
     covariance = _covariance(solver, blocks, state.poses[QUERY], np.tile(np.repeat(shown, 3), count))
     found = _result(state, blocks, iterations + more, covariance)
     place, turn = solver.apart.min(axis=0)
-    return replace(found, evident=evident, nearest=(float(place), float(turn)))
+    return replace(found, evident=errors, nearest=(float(place), float(turn)))
 
 
 def _result(state: _State, blocks: _Blocks, iterations: int, covariance: FloatArray | None) -> BundleResult:

@@ -236,6 +236,8 @@ def estimate_pose(
     alignment = Alignment(seen.xy[keep], seen.found[keep])
     at = at_query(refined.nearest, refined.turn, estimate.per_keyframe, estimate.world_from_camera)
     found = replace(estimate, aligned=aligned, at=at, seen=alignment)
+    if not options.evident:
+        return found
     # by what this query shows, what its keyframes' recordings do, and what is usual
     measured = weighted([keyframe.pose_errors for keyframe in keyframes], estimate.per_keyframe)
     return replace(found, recorded=recorded_errors(shrunk(refined.evident, measured), at))

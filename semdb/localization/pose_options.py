@@ -27,4 +27,5 @@ class PoseOptions:
     motion: MotionPrior = field(default_factory=MotionPrior)
     threads: int = field(default_factory=cores)  # keyframes are worked on side by side
     rematched: bool = True  # once images' turns are known; else the pairs of before are kept that agree then
+    evident: bool = True  # pairs say how far the poses of keyframes are off, for `recorded_covariance`
     most_pairs: int | None = None  # that are adjusted, evenly taken of all; None: every one

@@ -18,12 +18,18 @@ DARK = 80.0  # grey values between the 5th and 95th percentile below which contr
 BLOCK = 256  # pixels of a side of the pieces whose spectra are averaged
 SMALLEST = 160  # pixels of a side of an image in which motion is looked for
 SHORTEST, LONGEST = 6.0, 50.0  # pixels of motion that are looked for
+EXACT = 2**24  # float32 counts up to here
 LEAST_PEAK = 0.3  # of depth times height over its surroundings; images of the recordings without blur reach 0.27
 
 
 def contrast_range(grey: ImageArray) -> tuple[float, float, float, float]:
     """The 1st, 5th, 95th and 99th percentile of `grey` uint8 ``[H, W]``."""
-    counts = np.bincount(grey.reshape(-1), minlength=256).cumsum()
+    if grey.size <= EXACT:  # counts are float32
+        counts = (
+            cv2.calcHist([np.ascontiguousarray(grey)], [0], None, [256], [0, 256]).reshape(-1).cumsum(dtype=np.int64)
+        )
+    else:
+        counts = np.bincount(grey.reshape(-1), minlength=256).cumsum()
     found = np.searchsorted(counts, np.array([0.01, 0.05, 0.95, 0.99]) * counts[-1])
     low, fifth, other, high = map(float, found)
     return low, fifth, other, high

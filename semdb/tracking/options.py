@@ -33,7 +33,7 @@ class PlacingOptions:
     least_spread: float = 0.19
     most_sigma_m: float = 0.06
     most_sigma_deg: float = 1.5
-    pose: PoseOptions = field(default_factory=lambda: PoseOptions(most_pairs=400, rematched=False))
+    pose: PoseOptions = field(default_factory=lambda: PoseOptions(most_pairs=400, rematched=False, evident=False))
     verdict: VerdictOptions = field(default_factory=VerdictOptions)
 
 
