@@ -2,7 +2,7 @@
 
 ``python -m bench.tracking RECORDING... [--stride N] [--frames N] [--truth refined] [--json FILE]``. Every N-th frame is
 a keyframe, all others are tracked in their order, and each is localized beside it. Costs are without networks: local
-features and all after them, of the same run; `cpu` is processor time. With ``--truth refined`` keyframes and truth have
+features and all after them, in processor time of the same run. With ``--truth refined`` keyframes and truth have
 the poses that structure from motion gives, as with ``semdb evaluate``: those of the recordings differ from their images
 by more than steps do. Kidnapped: the camera jumps over a third of the recording, and ten frames of the next
 recording named (or of a rendered room) come in between; a frame is wrong when its state is ``tracking`` and it is more
@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 import semdb
@@ -32,13 +33,13 @@ from semdb.door.tracked import Tracked
 from semdb.evaluation.protocols import SPLIT
 from semdb.evaluation.tasks import GIVEN, REFINED, Part, Task, refine_truth
 from semdb.geometry import invert_pose, pose_error
+from semdb.perception.quality import with_contrast
 from semdb.recordings import Recording, open_recording
 from semdb.recordings.base import FrameEntry
 from semdb.recordings.synthetic import SyntheticOptions, write_synthetic_recording
 from semdb.trajectory.recording import times_of
-from semdb.types import FloatArray, Frame
+from semdb.types import FloatArray, Frame, Verdict
 
-WITHOUT_NETWORKS = ("features", "filter", "rank", "match", "pose")
 FALSE_M, FALSE_DEG = 0.25, 5.0
 FOREIGN, BLACKOUT_S = 10, 3.0
 GAP_NS = 200_000_000  # between frames after a jump
@@ -51,8 +52,7 @@ class Row:
     pose: FloatArray | None
     covariance: FloatArray | None
     truth: FloatArray
-    ms: float
-    cpu_ms: float = float("nan")
+    ms: float  # of processor time, without networks
 
 
 def main() -> None:
@@ -109,12 +109,12 @@ def measure(database: Database, recording: Recording, stride: int, most: int | N
     frames = [
         frame_of(recording, number, round(times_s[number] * 1e9)) for number in range(len(entries)) if number % stride
     ]
-    single, answers, cpu_ms = beside(database, frames)
+    single, answers, spent = beside(database, frames)
     again = database.tracker("tracked")
     smooth = list(smooth_answers((again.update(frame) for frame in frames), again))
     return {
         "single": scores(single),
-        "tracked": scores(rows_of(answers, frames, cpu_ms)),
+        "tracked": scores(rows_of(answers, frames, spent)),
         "smoothed": scores(rows_of(smooth, frames)),
         "states": Counter(str(answer.state) for answer in answers),
         "kidnapped": kidnapped(database, frames, open_recording(foreign)),
@@ -125,13 +125,13 @@ def measure(database: Database, recording: Recording, stride: int, most: int | N
 def beside(database: Database, frames: Sequence[Frame]) -> tuple[list[Row], list[Tracked], list[float]]:
     """Each frame as a single image and tracked, in turn, so that what else the machine does meets both alike."""
     tracker = database.tracker("tracked")
-    single, answers, cpu_ms = [], [], []
+    single, answers, spent = [], [], []
     for frame in frames:
         single.append(one_by_one(database, frame))
         started = time.process_time()
         answers.append(tracker.update(frame))
-        cpu_ms.append((time.process_time() - started) * 1000)
-    return single, answers, cpu_ms
+        spent.append((time.process_time() - started) * 1000)
+    return single, answers, spent
 
 
 def frame_of(recording: Recording, number: int, time_ns: int) -> Frame:
@@ -149,10 +149,15 @@ def frame_of(recording: Recording, number: int, time_ns: int) -> Frame:
 
 
 def one_by_one(database: Database, frame: Frame) -> Row:
-    """A single image, localized."""
-    answer = database.localize(frame, map="tracked", log=False)
-    spent = sum(answer.timing_ms.get(part, 0.0) for part in WITHOUT_NETWORKS)
-    pose = answer.world_from_camera if answer.localized else None
+    """A single image, localized; local features and all after them are timed."""
+    [entry] = database._here.maps().asked("tracked", "index")
+    description = entry.describer.describe(frame.image, None, frame.camera, frame.instances)
+    grey = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY), np.uint8)
+    started = time.process_time()
+    entry.describer.features.extract(with_contrast(grey)[0])
+    answer = entry.localizer.localize(description)
+    spent = (time.process_time() - started) * 1000
+    pose = answer.world_from_camera if answer.verdict is Verdict.LOCALIZED else None
     return Row(pose, answer.covariance, truth_of(frame), spent)
 
 
@@ -162,10 +167,10 @@ def truth_of(frame: Frame | FrameEntry) -> FloatArray:
     return frame.world_from_camera
 
 
-def rows_of(answers: Sequence[Tracked], frames: Sequence[Frame], cpu_ms: Sequence[float] | None = None) -> list[Row]:
-    spent = cpu_ms or [float("nan")] * len(frames)
+def rows_of(answers: Sequence[Tracked], frames: Sequence[Frame], spent: Sequence[float] | None = None) -> list[Row]:
+    spent = spent or [answer.latency_ms for answer in answers]
     return [
-        Row(a.world_from_camera if a.tracking else None, a.covariance, truth_of(f), a.latency_ms, ms)
+        Row(a.world_from_camera if a.tracking else None, a.covariance, truth_of(f), ms)
         for a, f, ms in zip(answers, frames, spent, strict=True)
     ]
 
@@ -183,7 +188,7 @@ def scores(rows: Sequence[Row]) -> dict[str, float]:
             if a.pose is not None and b.pose is not None
         ]
     ).reshape(-1, 2)
-    ms, cpu_ms = np.array([row.ms for row in rows]), np.array([row.cpu_ms for row in rows])
+    ms = np.array([row.ms for row in rows])
     return {
         "share": len(found) / len(rows),
         "median_m": float(np.median(errors[:, 0])),
@@ -196,8 +201,6 @@ def scores(rows: Sequence[Row]) -> dict[str, float]:
         "nees": float(np.median([nees(row) for row in found])),
         "ms": float(np.median(ms)),
         "p95_ms": float(np.percentile(ms, 95)),
-        "cpu_ms": float(np.median(cpu_ms)),
-        "cpu_p95_ms": float(np.percentile(cpu_ms, 95)),
     }
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,7 +13,14 @@ from semdb.geometry import pose_error
 from semdb.geometry.sensor import depth_noise
 from semdb.localization.bundle_kernels import depth_sigma
 from semdb.localization.matching import Evidence, MatchingOptions
-from semdb.localization.pose import _iterations_for, estimate_pose, first_pose, match_view, rival_pose
+from semdb.localization.pose import (
+    _iterations_for,
+    estimate_pose,
+    first_pose,
+    match_view,
+    recorded_covariance,
+    rival_pose,
+)
 from semdb.localization.pose_options import PoseOptions
 from semdb.localization.views import ClassNumbers, make_keyframe_view
 from tests.unit.localization_scene import CAMERA, DISTORTED, Scene
@@ -103,6 +112,24 @@ def test_bundle_adjustment_beats_pnp_when_depth_is_noisy() -> None:
             errors[bundle].append(pose_error(estimate.world_from_camera, truth)[0])
     assert np.median(errors[True]) < 0.005
     assert np.mean(errors[True]) < np.mean(errors[False])
+
+
+def test_a_pose_is_the_same_where_nothing_is_asked_of_recorded_poses() -> None:
+    scene, numbers = Scene(4, count=200), ClassNumbers()
+    keyframes = [scene.keyframe(i, scene.pose(0.3, 8), numbers, pixel_noise=0.5, depth_noise=0.01) for i in range(3)]
+    query = scene.query(scene.pose(0.3, 10), numbers, pixel_noise=0.5)
+    matches = [match_view(query, keyframe, NO_DEPTH.matching) for keyframe in keyframes]
+    usual = estimate_pose(query, keyframes, matches, NO_DEPTH)
+    less = estimate_pose(query, keyframes, matches, replace(NO_DEPTH, evident=False))
+    assert usual is not None
+    assert less is not None
+    np.testing.assert_array_equal(less.world_from_camera, usual.world_from_camera)
+    assert usual.covariance is not None
+    assert less.covariance is not None
+    np.testing.assert_array_equal(less.covariance, usual.covariance)
+    assert usual.recorded is not None
+    assert less.recorded is None
+    np.testing.assert_array_equal(recorded_covariance(less), usual.covariance)
 
 
 def test_query_depth_improves_the_position() -> None:

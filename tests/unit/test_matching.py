@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from semdb.localization.matching import (
     Evidence,
     MatchingOptions,
+    _in_both,
     closeness,
     distance_of,
     match_guided,
@@ -203,3 +204,13 @@ def test_the_two_greatest_of_rows_and_the_greatest_of_columns(columns: int) -> N
     np.testing.assert_array_equal(best_back, close.max(axis=0))
     expected = np.sort(close, axis=1)[:, -2] if columns > 1 else np.full(40, -1.0e38, np.float32)
     np.testing.assert_array_equal(second, expected)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    first=st.lists(st.integers(-1, 6) | st.sampled_from([-3, 5000]), max_size=12),
+    second=st.lists(st.integers(-1, 6) | st.sampled_from([-3, 5000]), max_size=12),
+)
+def test_numbers_of_both_are_those_of_sets(first: list[int], second: list[int]) -> None:
+    found = _in_both(np.array(first, np.int32), np.array(second, np.int32))
+    assert found == sorted(set(first) & set(second))
