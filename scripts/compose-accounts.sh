@@ -13,7 +13,7 @@ semdb_readable() {
   for table in \
     alembic_version cameras categories class_confusions cnn_vectors descriptors frame_views ingest_items \
     keyframe_categories keyframe_changes keyframe_images keyframe_qualities keyframes keypoints \
-    landmark_merges landmark_relations landmark_sightings landmark_views landmark_visits landmarks \
+    landmark_categories landmark_merges landmark_relations landmark_sightings landmark_views landmark_visits landmarks \
     loop_closures map_gravity map_models maps models object_features objects planned_links planned_poses \
     pose_covariances pose_errors pose_operations pose_revisions pose_sources queries recording_findings \
     recordings refined_points refinements keyframe_objects category_counts recording_summary covisible_objects \

@@ -1,7 +1,8 @@
 """How long `semdb find` takes in a database of many landmarks.
 
 ``python -m bench.landmarks.finding [--landmarks N] [--url URL]``. Made-up landmarks of 80 classes in maps of 1000, each
-with ten relations; URL is that of an empty database with the schema (default: a temporary SQLite file).
+with ten relations, and one in five may be of another class; URL is that of an empty database with the schema (default:
+a temporary SQLite file).
 """
 
 from __future__ import annotations
@@ -56,8 +57,17 @@ def fill(store: Store, number: int, per_map: int = 1000) -> None:
             for n in range(count)
             for _ in range(10)
         }
+        perhaps = [
+            {
+                **{"landmark_id": made + n + 1, "category_id": keys[int(rng.integers(80))], "map_id": map_id},
+                "probability": float(rng.uniform(0.002, 0.5)),
+            }
+            for n in range(count)
+            if rng.random() < 0.2
+        ]
         with store.engine.begin() as connection:
             connection.execute(insert(tables.landmarks), rows)
+            connection.execute(insert(tables.landmark_categories), perhaps)
             connection.execute(
                 insert(tables.landmark_relations),
                 [

@@ -2,7 +2,9 @@
 
 ``python -m bench.landmarks.real DATABASE_URL MAP LABELS``. The map has to be ingested and refined, and LABELS is a file
 of ``tests/data``: names, classes, and rough places. A confirmed landmark is right when it has a class of a thing and
-stands at its place; a second one of the same thing is a duplicate.
+stands at its place; a second one of the same thing is a duplicate. Beside it: in how many keyframes the detector saw
+each thing, an object of a class of it the middle of which lies at its place, one thing an object, and recall among
+things that it saw in at least three.
 """
 
 from __future__ import annotations
@@ -17,8 +19,10 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from bench.landmarks.scores import SEEN
 from semdb.database.landmark_reading import StoredLandmark, load_landmarks
-from semdb.database.store import open_store
+from semdb.database.store import Store, open_store
+from semdb.geometry import transform_points
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +69,21 @@ def tally(landmarks: Sequence[StoredLandmark], things: Sequence[dict[str, Any]])
     )
 
 
+def keyframes_that_saw(store: Store, map_id: int, things: Sequence[dict[str, Any]]) -> list[int]:
+    """In how many keyframes the detector saw each thing: its objects, each taken for the nearest thing of its class."""
+    seen: list[set[int]] = [set() for _ in things]
+    for one in store.iter_objects(map_id):
+        place = transform_points(one.world_from_camera, np.array([one.centroid]))[0]
+        away = [
+            float(np.linalg.norm(place - thing["place"])) if one.category in thing["classes"] else np.inf
+            for thing in things
+        ]
+        nearest = int(np.argmin(away))
+        if away[nearest] <= things[nearest]["within"]:
+            seen[nearest].add(one.keyframe)
+    return [len(keyframes) for keyframes in seen]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("database")
@@ -73,11 +92,18 @@ def main() -> None:
     given = parser.parse_args()
     things = json.loads(given.labels.read_text(encoding="utf-8"))["things"]
     with open_store(given.database) as store:
-        landmarks, _ = load_landmarks(store.engine, store.find_map(given.map).id)
+        map_id = store.find_map(given.map).id
+        landmarks, _ = load_landmarks(store.engine, map_id)
+        seen = dict(zip([thing["name"] for thing in things], keyframes_that_saw(store, map_id, things), strict=True))
     found = tally(landmarks, things)
     print(f"precision {found.precision:.3f}, recall {found.recall:.3f}, duplicates {found.duplicates:.3f}")
-    for name in ("found", "missed", "wrong", "twice"):
-        print(f"{name}: {', '.join(getattr(found, name)) or 'none'}")
+    well = [name for name, number in seen.items() if number >= SEEN]
+    known = sum(name in found.found for name in well)
+    print(f"seen by the detector in {SEEN} keyframes or more: {len(well)}, of which {known} are landmarks")
+    for part in ("found", "missed"):
+        print(f"{part}: {', '.join(f'{name} ({seen[name]})' for name in getattr(found, part)) or 'none'}")
+    for part in ("wrong", "twice"):
+        print(f"{part}: {', '.join(getattr(found, part)) or 'none'}")
 
 
 if __name__ == "__main__":

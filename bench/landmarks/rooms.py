@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from semdb.geometry import pose_from, so3_exp
+from semdb.geometry import pose_from, so3_exp, transform_points
 from semdb.landmarks.appearance import colours_of
 from semdb.landmarks.boxes import Box
 from semdb.landmarks.build import SeenKeyframe
@@ -17,6 +17,7 @@ from semdb.landmarks.options import LandmarkOptions
 from semdb.perception.box_masks import box_mask, depth_cluster_mask
 from semdb.recordings.synthetic import SyntheticOptions, SyntheticSequence
 from semdb.recordings.synthetic.mistakes import MISNAMED, make_mistakes, with_misnamed
+from semdb.refinement.confusion import MILLION, PlacedObjects, co_detections, confusions
 from semdb.types import BoolArray, Camera, Float32Array, FloatArray, ImageArray
 
 LEAST_SIDE = 0.03  # metres
@@ -152,6 +153,24 @@ def seen_keyframes(
         found.append(SeenKeyframe(lifted, category, scores, recording, colours=colours))
         labels.append(true)
     return found, labels
+
+
+def confusion_of(keyframes: Sequence[SeenKeyframe], classes: int) -> FloatArray:
+    """Shares ``[classes, classes]`` of what goes by another name, as `semdb refine` finds them of the objects."""
+    number, category, centre, half = [], [], [], []
+    for index, frame in enumerate(keyframes):
+        for name, sighting in zip(frame.category.tolist(), frame.lifted.sighting_of.tolist(), strict=True):
+            points = frame.lifted.points[sighting]
+            if len(points):
+                number.append(index)
+                category.append(name)
+                centre.append(transform_points(frame.lifted.world_from_camera, np.median(points, axis=0)[None])[0])
+                half.append(float(np.linalg.norm(np.subtract(*np.percentile(points, (95, 5), axis=0)))) / 2)
+    placed = PlacedObjects(np.array(number), np.array(category), np.array(centre).reshape(-1, 3), np.array(half))
+    shares = np.zeros((classes, classes))
+    for one in confusions(co_detections(placed, classes)):
+        shares[one.category, one.other] = one.weight / MILLION
+    return shares
 
 
 def shaped(mask: BoolArray, depth: Float32Array, shape: str) -> BoolArray:

@@ -133,7 +133,7 @@ def relation_counts(
     there = {main_label(thing, labels): thing for thing in landmarks if thing.state is LandmarkState.CONFIRMED}
     keys = sorted(key for key in there if key in things)
     up = np.array([0.0, 0.0, 1.0])
-    true = [_as_landmark(things[key], names) for key in keys]
+    true = [as_landmark(things[key], names) for key in keys]
 
     def scores_of(of: Sequence[Landmark]) -> dict[tuple[int, str, int], float]:
         return {(r.one, str(r.kind), r.other): r.score for r in find_relations(of, names, up, 0.05)}
@@ -153,7 +153,7 @@ def relation_counts(
     return counts
 
 
-def _as_landmark(thing: TrueThing, names: Sequence[str]) -> Landmark:
+def as_landmark(thing: TrueThing, names: Sequence[str]) -> Landmark:
     """A true thing as if it were a landmark that is known to a millimetre."""
     category = list(names).index(thing.category)
     evidence, sure = np.zeros(len(names)), np.eye(3) * 1e-6

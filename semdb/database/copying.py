@@ -32,6 +32,7 @@ LANDMARKS = (
     "landmark_views",
     "landmark_visits",
     "landmark_relations",
+    "landmark_categories",
     "landmark_merges",
 )
 NOT_COPIED = ("queries", "keyframe_changes", "pose_operations", "pose_revisions", "loop_closures", *LANDMARKS)

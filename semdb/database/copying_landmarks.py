@@ -37,6 +37,7 @@ def copy_landmarks(
             tables.landmark_views,
             tables.landmark_visits,
             tables.landmark_relations,
+            tables.landmark_categories,
         )
     }
     recordings = _recordings(source, map_id, target, target_map_id)
@@ -51,6 +52,8 @@ def copy_landmarks(
             ids[int(row["id"])] = new_id(connection, tables.landmarks, values)
         for row in hanging[tables.landmark_relations]:
             row["other_category_id"] = categories.get(int(row["other_category_id"] or 0))
+        for row in hanging[tables.landmark_categories]:
+            row |= {"map_id": target_map_id, "category_id": categories[int(row["category_id"])]}
         for table, found in hanging.items():
             _insert(connection, table, found, ids, objects, recordings)
 

@@ -25,13 +25,16 @@ from sqlalchemy import (
     literal,
     or_,
     select,
+    union_all,
 )
 from sqlalchemy.sql.elements import ColumnElement
+from sqlalchemy.sql.selectable import Subquery
 
 from semdb.database import retry
 from semdb.database.tables import (
     categories,
     keyframes,
+    landmark_categories,
     landmark_relations,
     landmark_sightings,
     landmark_views,
@@ -124,26 +127,29 @@ def _statement(wanted: _Shape) -> Select[Any]:
     m = landmarks.c
     conditions = _conditions(wanted)
     one: ColumnElement[Any] = literal(1.0)
-    near = one if not wanted.near else _maximum(_related("near", NEAR))
-    on = one if not wanted.on else _maximum(_related("on", ON))
+    near = one if not wanted.near else _relation("near", NEAR)
+    on = one if not wanted.on else _relation("on", ON)
     state = case((m.state == CONFIRMED, 1.0), else_=TENTATIVE)
     squared: ColumnElement[Any] = literal(0.0)
     if wanted.origin:
         x, y, z = (bindparam(name, type_=Double) for name in ("from_x", "from_y", "from_z"))
         squared = (m.x - x) * (m.x - x) + (m.y - y) * (m.y - y) + (m.z - z) * (m.z - z)
-    scored = (
-        select(
-            m.id.label("landmark_id"),
-            m.probability.label("class_score"),
-            near.label("near_score"),
-            on.label("on_score"),
-            state.label("state_score"),
-            (WALK_M * WALK_M / (WALK_M * WALK_M + squared)).label("distance_score"),
-            squared.label("distance_squared"),
-        )
-        .where(*conditions)
-        .subquery("scored")
+    parts = (
+        near.label("near_score"),
+        on.label("on_score"),
+        state.label("state_score"),
+        (WALK_M * WALK_M / (WALK_M * WALK_M + squared)).label("distance_score"),
+        squared.label("distance_squared"),
     )
+    rather = _rather_something_else(wanted)
+    scored = union_all(
+        select(m.id.label("landmark_id"), m.probability.label("class_score"), *parts).where(
+            m.category_id.in_(_ids_of("classes")), *conditions
+        ),
+        select(m.id.label("landmark_id"), rather.c.class_score, *parts)
+        .select_from(rather.join(landmarks, m.id == rather.c.landmark_id))
+        .where(m.category_id.not_in(_ids_of("classes")), *conditions),
+    ).subquery("scored")
     s = scored.c
     score = (s.class_score * s.near_score * s.on_score * s.state_score * s.distance_score).label("score")
     best = (
@@ -156,14 +162,40 @@ def _statement(wanted: _Shape) -> Select[Any]:
     return _with_details(best)
 
 
-def _maximum(related: Select[Any]) -> ColumnElement[Any]:
-    """The highest score, null where there is none; correlated, so not through a table of its own."""
-    return related.with_only_columns(func.max(landmark_relations.c.score)).correlate(landmarks).scalar_subquery()
+def _rather_something_else(wanted: _Shape) -> Subquery:
+    """Landmarks that are rather of another class, but may be of one that is looked for, and how likely."""
+    c = landmark_categories.c
+    found = select(c.landmark_id, func.sum(c.probability).label("class_score")).where(
+        c.category_id.in_(_ids_of("classes"))
+    )
+    if wanted.map_id:
+        found = found.where(c.map_id == bindparam("map_id"))
+    return found.group_by(c.landmark_id).subquery("rather")
+
+
+def _relation(names: str, kinds: Sequence[str]) -> ColumnElement[Any]:
+    """The highest score of a relation of the landmark of the query around to any of the classes; null without any.
+
+    Where it has none, one to what may be of them counts as much less as it is less likely. Correlated, so not through a
+    table of its own.
+    """
+    r, c = landmark_relations.c, landmark_categories.c
+    sure = _related(names, kinds).with_only_columns(func.max(r.score)).correlate(landmarks).scalar_subquery()
+    perhaps = (
+        select(func.max(r.score * c.probability))
+        .select_from(landmark_categories.join(landmark_relations, r.other_landmark_id == c.landmark_id))
+        .where(c.category_id.in_(_ids_of(names)), c.map_id == landmarks.c.map_id)
+        .where(r.landmark_id == landmarks.c.id, r.kind.in_(kinds))
+        .correlate(landmarks)
+        .scalar_subquery()
+    )
+    return func.coalesce(sure, perhaps)
 
 
 def _conditions(wanted: _Shape, *, gone: bool = False) -> list[ColumnElement[bool]]:
+    """What a landmark has to be besides of a class."""
     m = landmarks.c
-    found = [m.category_id.in_(_ids_of("classes")), m.state == GONE if gone else m.state != GONE]
+    found = [m.state == GONE if gone else m.state != GONE]
     if wanted.map_id:
         found.append(m.map_id == bindparam("map_id"))
     if wanted.not_near:
@@ -303,7 +335,7 @@ def _list_statement(wanted: _Shape, gone: bool) -> Select[Any]:
     last, last_of = keyframes.alias("last"), recordings.alias("last_of")
     newest = (
         select(m.id, m.last_seen_ns)
-        .where(*_conditions(wanted, gone=gone))
+        .where(m.category_id.in_(_ids_of("classes")), *_conditions(wanted, gone=gone))
         .order_by(m.last_seen_ns.desc(), m.id)
         .limit(bindparam("most", type_=Integer))
         .subquery("newest")

@@ -401,6 +401,15 @@ landmark_relations = table(
     Index(None, "landmark_id", "other_category_id", "kind", "score"),
 )
 
+# what a landmark may be instead of what it most likely is
+landmark_categories = table(
+    "landmark_categories",
+    reference("category_id", "categories.id", cascade=False, primary_key=True),
+    reference("map_id", "maps.id", primary_key=True, index=True),
+    reference("landmark_id", "landmarks.id", primary_key=True, index=True),
+    Column("probability", Double, nullable=False),
+)
+
 landmark_merges = table(
     "landmark_merges",
     Column("landmark_id", Id, primary_key=True, autoincrement=False),

@@ -1,9 +1,10 @@
 """A pose from things alone: an image's objects matched with the landmarks of a map, where texture fails.
 
-Hypotheses are the keyframes' poses, and poses that put pairs of objects where pairs of landmarks of their names are, at
-distances that are measured or judged by size, held as keyframes are. Each is scored by what should be seen from there:
-boxes that agree, landmarks that are missing, objects that the map does not have. The best are refined
-(Levenberg-Marquardt); one is an answer where it agrees well, and nothing elsewhere nearly as well.
+Hypotheses are the keyframes' poses, as they are and looking a little aside, and poses that put pairs of objects where
+pairs of landmarks of their names are, at distances that are measured or judged by size, held as keyframes are. Each is
+scored by what should be seen from there: boxes that agree, landmarks that are missing, objects that the map does not
+have. The best are refined (Levenberg-Marquardt); one is an answer where it agrees well, and nothing elsewhere nearly as
+well.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 
 from semdb.geometry import invert_pose, pixels_to_normalized, rotation_angle_deg
 from semdb.localization import landmark_kernels as kernels
-from semdb.localization.landmark_starts import poses_from_pairs
+from semdb.localization.landmark_starts import poses_from_pairs, turned_cameras
 from semdb.types import Camera, FloatArray, Int64Array
 
 
@@ -27,6 +28,7 @@ class LandmarkPoseOptions:
     most_detections: int = 24
     most_pairs: int = 400  # of pairs of an object with a landmark
     most_keyframes: int = 400  # whose poses are tried, evenly chosen of a larger map
+    most_turned: int = 1200  # keyframes' poses that are turned aside
     ways_to_hold: int = 6  # the camera
     distance_slack: float = 0.35  # by which distances judged by size may be wrong, as a share
     refined: int = 24  # hypotheses
@@ -38,8 +40,9 @@ class LandmarkPoseOptions:
     least_lead: float = 2.0  # of the score, over the best pose elsewhere
     elsewhere_m: float = 0.7
     elsewhere_deg: float = 20.0
-    least_trust: float = 0.79
-    covariance_scale: float = 4.0
+    least_trust: float = 0.8
+    covariance_scale: float = 3.0
+    usual_residuals: float = 20.0  # of one standard deviation, that are added to those of an image
     most_sigma_m: float = 0.7
     most_sigma_deg: float = 17.0
 
@@ -90,6 +93,7 @@ class LandmarkPose:
     lead: float  # over the best pose elsewhere
     matched: int
     expected: int  # landmarks that lie in the image
+    overlap: float  # sum over matched landmarks of how far their boxes are those that are seen (IoU)
     sureness: float  # mean score of the detections
     measured: bool  # whether depth has places of things
     sigma_m: float
@@ -99,12 +103,12 @@ class LandmarkPose:
     def trust(self) -> float:
         """The probability that the pose is right rather than of another place, as fitted.
 
-        Detections that are all of one high score, as masks that a recording brings are, overrate how much they say;
-        and distances, which are much the same in all rooms, do.
+        Detections that are all of one high score, as masks that a recording brings are, overrate how much they say; and
+        boxes that only half agree are what another place gives, too.
         """
         sure = (self.sureness - 0.6) / 0.3
-        value = self.score * (2.94 - 1.75 * sure) / 10 + 1.04 * min(max(self.lead, 0.0), 25.0) / 10 + 0.45 * sure
-        value -= 0.28 * np.log(max(self.matched, 1)) + (0.41 if self.measured else 0.0) + 4.12
+        value = self.score * (2.53 - 1.12 * sure) / 10 + 1.51 * min(max(self.lead, 0.0), 25.0) / 10 - 0.11 * sure
+        value += 2.43 * self.overlap / 5 + 2.84 * self.overlap / max(self.matched, 1) - 8.19
         return float(1 / (1 + np.exp(-value)))
 
     def doubt(self, options: LandmarkPoseOptions) -> str:
@@ -169,7 +173,7 @@ def find_pose(things: SeenThings, landmarks: MapLandmarks, options: LandmarkPose
     found = sorted((search.refine(k) for k in search.likeliest()), key=lambda one: -one.score)
     best = found[0]
     others = [one.score for one in found[1:] if _is_elsewhere(one.pose, best.pose, options)]
-    covariance = _covariance(best.pose, best.information, options)
+    covariance = _covariance(best.pose, best.information, options) * search.looseness(best)
     return LandmarkPose(
         world_from_camera=invert_pose(best.pose),
         covariance=covariance,
@@ -177,6 +181,7 @@ def find_pose(things: SeenThings, landmarks: MapLandmarks, options: LandmarkPose
         lead=best.score - max(others, default=0.0),
         matched=int(np.count_nonzero(best.assigned >= 0)),
         expected=search.expected(best.pose),
+        overlap=search.overlap(best),
         sureness=float(things.scores.mean()),
         measured=bool(np.isfinite(things.points).any()),
         sigma_m=float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])),
@@ -212,7 +217,8 @@ class _Search:
             slack=options.distance_slack,
             most=options.most_pairs,
         )
-        self._starts = np.ascontiguousarray(np.concatenate([self._cameras, pairs]))
+        aside = turned_cameras(self._cameras, landmarks.level, options.most_turned)
+        self._starts = np.ascontiguousarray(np.concatenate([self._cameras, aside, pairs]))
         self._table = np.empty((len(landmarks), len(things)))
         self._widths = np.array(options.widths)
 
@@ -258,6 +264,29 @@ class _Search:
         box, of = np.empty(4), self._landmarks
         inside = [kernels.predict(of.corners[m], of.centres[m], pose, self._things.frame, box) for m in range(len(of))]
         return sum(share >= kernels.LEAST_INSIDE for share in inside)
+
+    def looseness(self, found: _Refined) -> float:
+        """How much larger than one the squared residuals are, with usual ones: boxes of some images fit better."""
+        off = np.zeros(5 * max(int(np.count_nonzero(found.assigned >= 0)), 1))
+        count = kernels.residuals(*self._fitted, found.pose, found.assigned, off)
+        off = np.minimum(np.abs(off[:count]), kernels.MOST_PULL)
+        usual = self._options.usual_residuals
+        return float((usual + (off * off).sum()) / (usual + np.count_nonzero(off)))
+
+    def overlap(self, found: _Refined) -> float:
+        """The sum of the intersections over union of expected and seen boxes of what is matched."""
+        box, of, total = np.empty(4), self._landmarks, 0.0
+        for m in np.flatnonzero(found.assigned >= 0).tolist():
+            kernels.predict(of.corners[m], of.centres[m], found.pose, self._things.frame, box)
+            total += intersection_over_union(box, self._things.boxes[found.assigned[m]])
+        return total
+
+
+def intersection_over_union(one: FloatArray, other: FloatArray) -> float:
+    """Of two boxes ``[4]``: x1, y1, x2, y2."""
+    low, high = np.maximum(one[:2], other[:2]), np.minimum(one[2:], other[2:])
+    shared = float(np.prod(np.maximum(high - low, 0)))
+    return shared / max(float(np.prod(one[2:] - one[:2]) + np.prod(other[2:] - other[:2])) - shared, 1e-12)
 
 
 def _places(cameras: FloatArray) -> FloatArray:

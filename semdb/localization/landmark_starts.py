@@ -1,13 +1,42 @@
-"""Where a camera may stand: poses at which two objects of an image lie where two landmarks of a map are."""
+"""Where a camera may stand: poses at which two objects of an image lie where two landmarks of a map are, and keyframes
+that look a little aside.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
+from semdb.geometry import so3_exp
 from semdb.types import FloatArray, Int64Array
 
 LEAST_APART_M = 0.15  # two landmarks nearer to each other do not tell a direction
 LEAST_TURN_DEG = 6.0  # between two ways to hold the camera
+
+# degrees about up and about the camera's x, the likeliest first: of two dozen books in a shelf pairs tell nothing, and
+# a keyframe's pose puts each on its neighbour
+TURNS = tuple(
+    sorted(
+        ((yaw, tilt) for yaw in (-15.0, -10.0, -5.0, 0.0, 5.0, 10.0, 15.0) for tilt in (-5.0, 0.0, 5.0) if yaw or tilt),
+        key=lambda turn: (turn[0] ** 2 + 4 * turn[1] ** 2, turn),
+    )
+)
+
+
+def turned_cameras(cameras: FloatArray, level: FloatArray, most: int) -> FloatArray:
+    """`cameras` ``[k, 4, 4]`` (camera_from_world) that look elsewhere from where they are, at most `most` of them.
+
+    Each is turned in as many of `TURNS` as all can be; `level` as in `poses_from_pairs`.
+    """
+    place = -np.einsum("nji,nj->ni", cameras[:, :3, :3], cameras[:, :3, 3])
+    found = [np.empty((0, 4, 4))]
+    for yaw, tilt in TURNS[: most // max(len(cameras), 1)]:
+        turned = np.zeros_like(cameras)
+        about_x, about_up = so3_exp(np.array([np.radians(tilt), 0.0, 0.0])), so3_exp(level[:, 2] * np.radians(yaw))
+        turned[:, :3, :3] = about_x @ cameras[:, :3, :3] @ about_up
+        turned[:, :3, 3] = -np.einsum("nij,nj->ni", turned[:, :3, :3], place)
+        turned[:, 3, 3] = 1
+        found.append(turned)
+    return np.concatenate(found)
 
 
 def poses_from_pairs(

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from semdb.api.finding import find
 from semdb.cli.main import app
+from semdb.database.ids import SharedIds
 from semdb.database.landmark_search import Wanted, statement
 from semdb.database.store import Store, open_store
 from semdb.errors import UsageError
@@ -68,6 +69,25 @@ def test_a_hit_has_all_that_is_known(store: Store, landmarks: list[int]) -> None
     with store.engine.connect() as connection:  # what --sql prints is what was asked
         assert [row.landmark_id for row in connection.execute(text(answer.sql.replace(":", "\\:")))] == [landmarks[4]]
     json.dumps(answer.as_dict())
+
+
+def test_what_is_rather_something_else_comes_last(store: Store) -> None:
+    """Every landmark may be a vase, at 0.03: a search for one finds them, and things near them, as much later."""
+    map_id, _, _ = fill(store)
+    SharedIds(store.engine).categories(["vase"])
+    table, cup, chair, *_, banana, _ = stored_landmarks(store, map_id)
+    hits = find(store, "vase", on="table").hits
+    assert [hit.landmark_id for hit in hits] == [cup, banana]
+    assert hits[0].parts == pytest.approx({"class": 0.03, "on": 0.98, "state": 1.0})
+    assert hits[0].category == "cup"
+    near = find(store, "chair", near="vase").hits
+    assert [hit.landmark_id for hit in near] == [chair]
+    assert near[0].parts["near"] == pytest.approx(0.9 * 0.03)
+    assert found(store, "furniture") == [table, chair]
+    assert found(store, "crockery", on="vase") == [cup]
+    store.delete_map(map_id)
+    with store.engine.connect() as connection:
+        assert connection.execute(text("SELECT COUNT(*) FROM landmark_categories")).scalar() == 0
 
 
 def test_when_it_was_seen(store: Store, landmarks: list[int]) -> None:

@@ -15,9 +15,11 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import Engine, inspect, text
 
 import semdb.migrations
+from semdb.api.finding import find
 from semdb.database import schema, tokens
 from semdb.database.engine import make_engine
 from semdb.database.frame_views import FrameHead, FrameRow, load_frame_heads, load_frames, write_frame_views
+from semdb.database.ids import SharedIds
 from semdb.database.landmark_rows import load_gravity
 from semdb.database.links import list_links
 from semdb.database.pose_errors import load_pose_errors, replace_pose_errors
@@ -208,6 +210,22 @@ def test_landmarks_of_before_get_visits(engine: Engine, empty_url: str) -> None:
         assert len(stored_landmarks(store, map_id)) == 7
     with engine.connect() as connection:
         assert connection.execute(text("SELECT COUNT(*) FROM landmark_visit_list")).scalar() == 7
+
+
+def test_landmarks_of_before_are_of_one_class(engine: Engine, empty_url: str) -> None:
+    schema.upgrade(engine)
+    with open_store(empty_url) as store:
+        map_id, _, _ = fill(store)
+        SharedIds(engine).categories(["vase"])
+        stored_landmarks(store, map_id)
+    schema.downgrade(engine, "0015")
+    assert "landmark_categories" not in inspect(engine).get_table_names()
+    schema.upgrade(engine)
+    with open_store(empty_url) as store:
+        assert find(store, "vase").hits == ()
+        assert len(find(store, "cup", on="dining table").hits) == 1
+        stored_landmarks(store, map_id)  # computed anew
+        assert len(find(store, "vase").hits) == 7
 
 
 def test_keyframes_of_before_have_no_quality(engine: Engine, empty_url: str) -> None:
