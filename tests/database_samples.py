@@ -152,7 +152,7 @@ def stored_landmarks(store: Store, map_id: int) -> list[int]:
         ("banana", (2.4, 0.9, 0.8), (0.2, 0.05, 0.04)),
         ("book", (0.0, -1.0, 0.02), (0.2, 0.15, 0.03)),
     ]
-    SharedIds(store.engine).categories([name for name, *_ in things])
+    SharedIds(store.engine).categories([*(name for name, *_ in things), "vase"])
     query = select(tables.objects.c.id, tables.objects.c.keyframe_id)
     query = query.select_from(tables.objects.join(tables.keyframes).join(tables.recordings))
     query = query.where(tables.recordings.c.map_id == map_id).order_by(tables.objects.c.id)
@@ -173,6 +173,7 @@ def stored_landmarks(store: Store, map_id: int) -> list[int]:
                         "second visit", "absent" if name == "book" else "unobserved", 0, 9, 0, 9, 0, 0, None, None
                     ),
                 ),
+                perhaps={"vase": 0.03},
             )
         )
     relations = [

@@ -36,13 +36,13 @@ from bench.landmarks.scores import SEEN, as_landmark, main_label
 from semdb.api.finding import find
 from semdb.database import tables
 from semdb.database.ids import SharedIds
-from semdb.database.landmark_rows import LEAST_LIKELY
 from semdb.database.landmark_search import NEAR, ON
 from semdb.database.store import Store, open_store
 from semdb.landmarks.boxes import upright_axes
-from semdb.landmarks.build import find_landmarks
+from semdb.landmarks.build import SeenKeyframe, find_landmarks
+from semdb.landmarks.evidence import perhaps
 from semdb.landmarks.relations import find_relations
-from semdb.landmarks.values import Landmarks
+from semdb.landmarks.values import Landmark, Landmarks
 from semdb.types import FloatArray
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -120,8 +120,14 @@ def questions(things: Mapping[int, TrueThing], seen: frozenset[int], places: Seq
     return listed
 
 
-def write(store: Store, map_name: str, found: Landmarks, names: Sequence[str]) -> list[int]:
-    """The landmarks as rows; their ids."""
+def write(
+    store: Store, map_name: str, found: Landmarks, names: Sequence[str], keyframes: Sequence[SeenKeyframe]
+) -> list[int]:
+    """The landmarks of keyframes as rows; their ids."""
+
+    def named_of(thing: Landmark) -> list[int]:
+        return [int(keyframes[m.keyframe].category[m.ordinal]) for m in thing.members]
+
     ids = SharedIds(store.engine).categories(names)
     map_id = store.ensure_map(map_name)
     axes = upright_axes(found.gravity.up)
@@ -150,13 +156,12 @@ def write(store: Store, map_name: str, found: Landmarks, names: Sequence[str]) -
             }
             for r in find_relations(found.landmarks, names, found.gravity.up)
         ]
-        perhaps = [
-            {"landmark_id": key, "category_id": ids[name], "map_id": map_id, "probability": float(share)}
+        others = [
+            {"landmark_id": key, "category_id": ids[names[k]], "map_id": map_id, "probability": share}
             for key, one in zip(keys, found.landmarks, strict=True)
-            for name, share in zip(names, one.evidence, strict=True)
-            if share >= LEAST_LIKELY and name != names[one.category]
+            for k, share in perhaps(one.evidence, one.category, named_of(one)).items()
         ]
-        for table, listed in ((tables.landmark_relations, related), (tables.landmark_categories, perhaps)):
+        for table, listed in ((tables.landmark_relations, related), (tables.landmark_categories, others)):
             if listed:
                 connection.execute(insert(table), listed)
     return keys
@@ -192,7 +197,7 @@ def ask(store: Store, room: RenderedRoom, setting: str) -> Iterator[Asked]:
             counts[label] = counts.get(label, 0) + 1
     seen = frozenset(key for key in things if counts.get(key, 0) >= SEEN and things[key].keyframes >= SEEN)
     name = f"room {room.seed}, {setting}"
-    keys = write(store, name, found, list(numbers))
+    keys = write(store, name, found, list(numbers), keyframes)
     label_of = {key: main_label(one, labels) for key, one in zip(keys, found.landmarks, strict=True)}
     places = [frame.pose[:3, 3] for frame in room.frames[:: max(1, len(room.frames) // PLACES)]]
     for question in questions(things, seen, places):

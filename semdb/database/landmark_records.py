@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from semdb.types import Camera, Float32Array, FloatArray
 
@@ -58,7 +58,7 @@ class LandmarkVisit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkRow:
-    """A landmark as it is stored, but for its id."""
+    """A landmark as it is stored, but for its id. `perhaps`: other classes that it may be, with their probabilities."""
 
     category: str
     probability: float
@@ -79,6 +79,7 @@ class LandmarkRow:
     views: tuple[LandmarkView, ...]
     visits: tuple[LandmarkVisit, ...] = ()
     appearance: Float32Array | None = None
+    perhaps: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

@@ -44,7 +44,6 @@ LANDMARKS = "landmarks"  # the step of `semdb refine`
 CHUNK = 500
 READ_CHUNK = 16  # keyframes
 VISIT_COUNTS = ("keyframes", "points", "seen", "seen_through", "occluded", "missed")
-LEAST_LIKELY = 0.002  # of a class that a landmark may be: what no sighting was called has less
 _UP = ("up_x", "up_y", "up_z")
 
 
@@ -134,7 +133,7 @@ def replace_landmarks(connection: Connection, map_id: int, found: LandmarkSet, k
     old = _landmark_of_objects(connection, map_id)
     kept = keep(old, [[s.object_id for s in row.sightings] for row in found.landmarks])
     _delete_landmarks(connection, map_id)
-    names = {name for row in found.landmarks for name in (row.category, *row.evidence)}
+    names = {name for row in found.landmarks for name in (row.category, *row.perhaps)}
     known = _category_ids(connection, sorted(names))
     ids: list[int] = []
     told: list[dict[str, Any]] = []
@@ -171,8 +170,7 @@ def replace_landmarks(connection: Connection, map_id: int, found: LandmarkSet, k
     perhaps = [
         {"landmark_id": key, "category_id": known[name], "map_id": map_id, "probability": share}
         for key, row in numbered
-        for name, share in sorted(row.evidence.items())
-        if name != row.category and share >= LEAST_LIKELY and name in known
+        for name, share in sorted(row.perhaps.items())
     ]
     _insert(connection, landmark_categories, perhaps)
     _keep_merges(connection, map_id, {key: ids[number] for key, number in kept.merged.items()}, set(ids))

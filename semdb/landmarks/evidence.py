@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from semdb.types import FloatArray, Int64Array
 
 FLOOR = 0.02  # of the probability of any name, whatever the thing is
+LEAST_LIKELY = 0.002  # of a class that a thing may be
 SURE = 0.9  # share of right names of a class whose confusions nobody knows
 
 
@@ -40,3 +43,9 @@ def fuse(category: Int64Array, score: FloatArray, names: FloatArray) -> FloatArr
     total = np.rint(likelihood * 1e9).astype(np.int64).sum(axis=0) / 1e9
     found = np.exp(total - total.max())
     return np.asarray(found / found.sum(), np.float64)
+
+
+def perhaps(evidence: FloatArray, category: int, named: Iterable[int]) -> dict[int, float]:
+    """Other classes that a thing may be, of those that it was `named`, with their probabilities: by number."""
+    others = sorted(set(named) - {category})
+    return {k: round(float(evidence[k]), 6) for k in others if evidence[k] >= LEAST_LIKELY}

@@ -178,8 +178,10 @@ def _stored(
     found: Any, rows: Sequence[KeyframeDepth], classes: Sequence[str], recordings: Sequence[str], *, told: bool
 ) -> LandmarkSet:
     from semdb.landmarks.boxes import upright_axes
+    from semdb.landmarks.evidence import perhaps
     from semdb.landmarks.relations import find_relations
 
+    numbers = {name: k for k, name in enumerate(classes)}
     axes = upright_axes(found.gravity.up)
     stored = []
     for thing in found.landmarks:
@@ -188,6 +190,8 @@ def _stored(
             classes[k]: round(float(value), 6) for k, value in enumerate(thing.evidence) if value >= LEAST_EVIDENCE
         }
         times = [rows[m.keyframe].timestamp_ns for m in thing.members]
+        named = [numbers[rows[m.keyframe].objects[m.ordinal].category] for m in thing.members]
+        others = perhaps(thing.evidence, thing.category, named)
         known = [time for time in times if time is not None]
         x, y, z = (float(value) for value in thing.box.centre)
         sx, sy, sz = (float(value) for value in thing.box.size)
@@ -217,6 +221,7 @@ def _stored(
                 ),
                 visits=tuple(_visit(visit, recordings) for visit in thing.visits),
                 appearance=thing.colours,
+                perhaps={classes[k]: share for k, share in others.items()},
             )
         )
     related = find_relations(found.landmarks, classes, found.gravity.up)

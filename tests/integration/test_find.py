@@ -13,7 +13,6 @@ from typer.testing import CliRunner
 
 from semdb.api.finding import find
 from semdb.cli.main import app
-from semdb.database.ids import SharedIds
 from semdb.database.landmark_search import Wanted, statement
 from semdb.database.store import Store, open_store
 from semdb.errors import UsageError
@@ -74,7 +73,6 @@ def test_a_hit_has_all_that_is_known(store: Store, landmarks: list[int]) -> None
 def test_what_is_rather_something_else_comes_last(store: Store) -> None:
     """Every landmark may be a vase, at 0.03: a search for one finds them, and things near them, as much later."""
     map_id, _, _ = fill(store)
-    SharedIds(store.engine).categories(["vase"])
     table, cup, chair, *_, banana, _ = stored_landmarks(store, map_id)
     hits = find(store, "vase", on="table").hits
     assert [hit.landmark_id for hit in hits] == [cup, banana]

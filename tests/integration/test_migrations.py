@@ -19,7 +19,6 @@ from semdb.api.finding import find
 from semdb.database import schema, tokens
 from semdb.database.engine import make_engine
 from semdb.database.frame_views import FrameHead, FrameRow, load_frame_heads, load_frames, write_frame_views
-from semdb.database.ids import SharedIds
 from semdb.database.landmark_rows import load_gravity
 from semdb.database.links import list_links
 from semdb.database.pose_errors import load_pose_errors, replace_pose_errors
@@ -216,7 +215,6 @@ def test_landmarks_of_before_are_of_one_class(engine: Engine, empty_url: str) ->
     schema.upgrade(engine)
     with open_store(empty_url) as store:
         map_id, _, _ = fill(store)
-        SharedIds(engine).categories(["vase"])
         stored_landmarks(store, map_id)
     schema.downgrade(engine, "0015")
     assert "landmark_categories" not in inspect(engine).get_table_names()

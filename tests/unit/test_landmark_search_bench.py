@@ -10,6 +10,7 @@ from bench.landmarks.searching import Asked, Question, Tally, questions, tallies
 from bench.landmarks.together import names_of
 from semdb.geometry import rotation_angle_deg, so3_exp
 from semdb.landmarks.boxes import Box
+from semdb.landmarks.evidence import fuse, name_probabilities, perhaps
 from semdb.localization.landmark_pose import intersection_over_union
 from semdb.localization.landmark_starts import TURNS, turned_cameras
 
@@ -75,3 +76,12 @@ def test_overlap_of_boxes() -> None:
     assert intersection_over_union(one, one) == pytest.approx(1)
     assert intersection_over_union(one, one + np.array([1, 0, 1, 0])) == pytest.approx(1 / 3)
     assert intersection_over_union(one, one + 5) == 0
+
+
+def test_what_a_thing_may_be_is_what_it_was_called() -> None:
+    evidence = fuse(np.array([3, 3, 5]), np.array([0.9, 0.9, 0.9]), name_probabilities(20))
+    found = perhaps(evidence, 3, [3, 3, 5])
+    assert set(found) == {5}
+    assert 0.002 < found[5] < 0.02
+    assert perhaps(evidence, 3, [3]) == {}
+    assert perhaps(fuse(np.array([3] * 6 + [5]), np.full(7, 0.9), name_probabilities(20)), 3, [3, 5]) == {}
