@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from sqlalchemy import Connection, Engine, Table, insert, select
+from sqlalchemy import Connection, Engine, Table, insert, select, union
 
 from semdb.database import checked, retry, tables
 from semdb.database.copying_landmarks import copy_landmarks
@@ -79,7 +79,10 @@ def copy_map(source: Engine, map_id: int, target: Engine, name: str, *, progress
             f"the map {name!r} was described anew by another encoder while it was copied: remove the copy and start "
             "again"
         )
-    used = select(tables.landmarks.c.category_id).where(tables.landmarks.c.map_id == map_id)
+    m, c = tables.landmarks.c, tables.landmark_categories.c
+    used = union(
+        select(m.category_id).where(m.map_id == map_id), select(c.category_id).where(c.map_id == map_id)
+    ).scalar_subquery()
     names = _rows(source, select(tables.categories.c.id).where(tables.categories.c.id.in_(used)))
     known = retry.write(target, lambda connection: _categories(copy, connection, names))
     copy_landmarks(source, map_id, target, copy.ids["maps"][map_id], known)
