@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -61,8 +62,12 @@ def find(
         seen_in=seen_in,
         origin=None if origin is None else _origin(origin),
         limit=limit,
+        perhaps=map_id is not None,
     )
     found, evidence = rows.search(store.engine, wanted)
+    if not found and not wanted.perhaps:
+        wanted = replace(wanted, perhaps=True)
+        found, evidence = rows.search(store.engine, wanted)
     hits = tuple(_hit(row, evidence.get(int(row.landmark_id), []), wanted) for row in found)
     understood: dict[str, Mapping[str, Any]] = {name: item.as_dict() for name, item in meant.items()}
     missing = None if hits else _missing(store, wanted, meant)

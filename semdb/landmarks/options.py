@@ -117,7 +117,8 @@ class VisitOptions:
     seen through where all that was measured about it is farther by `through_m` + `through_deviations`. A deviation is
     that of depth there and that by which the visit's keyframe disagrees with its neighbours, `least_noise` of what
     structured light has at least. A thing is absent
-    where at least `through_share` of its points are seen through, and `through_to_seen` times as many as are seen. A
+    where at least `through_share` of its points are seen through, and `through_to_seen` times as many as are seen; or
+    where it is `clear_share` and `clear_to_seen`, since the rest is hidden. A
     keyframe that sees `missed_share` of them in no mask missed it.
     """
 
@@ -129,6 +130,8 @@ class VisitOptions:
     least_noise: float = 0.25
     through_share: float = 0.4
     through_to_seen: float = 1.0
+    clear_share: float = 0.3
+    clear_to_seen: float = 10.0
     missed_share: float = 0.5
 
 

@@ -10,7 +10,7 @@ classes that contain (VLA-3D), distance of boxes for nearness. docs/landmarks.md
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -23,6 +23,7 @@ from semdb.types import FloatArray
 FLOOR_SCORE = 0.3  # relations of less are no rows
 NEAR_M = 1.0  # boxes so far apart are near with a score of one half
 NEXT_M = 0.35
+LEAST_GROUND_M = 0.06  # sides of footprints: whether a book stands over another one hangs on no centimetre
 REACH_M = 2.5  # from box to box: nothing is related beyond
 HOLDS = frozenset(
     (
@@ -102,11 +103,12 @@ def find_relations(
 
 
 def _standing(thing: Landmark, names: Sequence[str], axes: FloatArray) -> _Standing:
-    ground = footprint(thing.box, axes)
+    size = np.maximum(thing.box.size, (LEAST_GROUND_M, LEAST_GROUND_M, 0.0))
+    ground = footprint(replace(thing.box, size=size), axes)
     middle = float(thing.box.centre @ axes[:, 2])
     half = float(thing.box.size[2]) / 2
     sigma = float(np.sqrt(max(np.trace(thing.covariance) / 3, 0.0)))
-    area = float(thing.box.size[0] * thing.box.size[1])
+    area = float(size[0] * size[1])
     return _Standing(ground, middle - half, middle + half, area, sigma, names[thing.category])
 
 

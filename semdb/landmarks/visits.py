@@ -99,7 +99,8 @@ def visits_of(
 
 def _without(counts: IntArray, points: int, visit: VisitOptions) -> Presence:
     """Of a visit that shows no sighting."""
-    if counts[THROUGH] >= max(visit.through_share * points, visit.through_to_seen * counts[SEEN], 1):
+    shares = ((visit.through_share, visit.through_to_seen), (visit.clear_share, visit.clear_to_seen))
+    if any(counts[THROUGH] >= max(share * points, to_seen * counts[SEEN], 1) for share, to_seen in shares):
         return Presence.ABSENT
     return Presence.UNOBSERVED
 
