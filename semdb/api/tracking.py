@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from semdb.tracking.options import TrackerOptions
     from semdb.types import FloatArray, Localization
 
-LOOKED_S = 1.0  # between two looks at what other processes did to the map
+LOOKED_S = 1.0  # between two looks at what other processes did to the keyframes of the map
+HEADS_S = 10.0  # and at whether it was refined or described anew, which takes longer
 LAG = 60  # frames that a smoothed pose waits for
 
 
@@ -39,7 +40,7 @@ class MapTracker:
         self._maps, self._reader = maps, reader
         self._entry = one_map(maps, map_name)
         self._tracker = Tracker(self._entry.localizer.cache, options)
-        self._looked_s = -np.inf
+        self._looked_s, self._heads_s = -np.inf, -np.inf
         self._number = 0
 
     @property
@@ -115,11 +116,13 @@ class MapTracker:
         if now - self._looked_s < LOOKED_S:
             return
         self._looked_s = now
-        entry = one_map(self._maps, self.map)
-        if entry is not self._entry:
-            self._entry = entry
-            self._tracker.keyframes = entry.localizer.cache
-        entry.localizer.refresh()
+        if now - self._heads_s >= HEADS_S:
+            self._heads_s = now
+            entry = one_map(self._maps, self.map)
+            if entry is not self._entry:
+                self._entry = entry
+                self._tracker.keyframes = entry.localizer.cache
+        self._entry.localizer.refresh()
 
 
 class TrackingCameras(Localizing):
