@@ -139,23 +139,25 @@ _MOST_OF_UNIT = 1.01  # a number of a vector of length one
 
 def _equal_vectors(blobs: Sequence[Any]) -> Float32Array | None:
     """Vectors ``[n, d]`` of blobs that all begin alike and are whole; None of others."""
-    head, start, size = blobs[0][:_CHECKED], _HEADER.size + 4, len(blobs[0])
-    if any(not isinstance(blob, bytes) for blob in blobs) or size <= start or (size - start) % 4:
+    size, start = len(blobs[0]), HEAD + 4
+    if set(map(type, blobs)) != {bytes} or set(map(len, blobs)) != {size} or size <= start or (size - start) % 4:
         return None
-    first = _HEADER.pack(ARRAY_MAGIC, 1, _CODES[np.dtype("<f4")], 1, 0, 0)[:_CHECKED]
-    tail, seed = struct.pack("<I", (size - start) // 4), crc32(head)
-    if head != first or blobs[0][_HEADER.size : start] != tail:
+    head = _HEADER.pack(ARRAY_MAGIC, 1, _CODES[np.dtype("<f4")], 1, 0, 0)[:_CHECKED]
+    tail = struct.pack("<I", (size - start) // 4)
+    heads = np.frombuffer(b"".join([blob[:start] for blob in blobs]), np.uint8).reshape(len(blobs), start)
+    if (heads[:, :_CHECKED] != np.frombuffer(head, np.uint8)).any() or (
+        heads[:, HEAD:] != np.frombuffer(tail, np.uint8)
+    ).any():
         return None
     found = np.empty((len(blobs), (size - start) // 4), np.dtype("<f4"))
-    out, at = found.reshape(-1).view(np.uint8).data, 0
+    out, at, seed, sums = found.reshape(-1).view(np.uint8).data, 0, crc32(tail, crc32(head)), []
     for blob in blobs:
-        if len(blob) != size or not blob.startswith(head) or not blob.startswith(tail, _HEADER.size):
-            return None
-        view = memoryview(blob)
-        if crc32(view[_HEADER.size :], seed) != int.from_bytes(blob[_CHECKED : _HEADER.size], "little"):
-            return None
-        out[at : at + size - start] = view[start:]
-        at += size - start
+        end = at + size - start
+        out[at:end] = memoryview(blob)[start:]
+        sums.append(crc32(out[at:end], seed))
+        at = end
+    if not np.array_equal(np.array(sums, np.uint32), np.ascontiguousarray(heads[:, _CHECKED:HEAD]).view("<u4")[:, 0]):
+        return None
     return found.astype(np.float32, copy=False)
 
 
