@@ -16,11 +16,12 @@ Rng = np.random.Generator
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """An image with what must be known of it. `instances` where the recording brings masks."""
+    """An image with what must be known of it. `instances` where the recording brings masks; `depth` in metres."""
 
     image: ImageArray
     camera: Camera
     instances: InstanceMasks | None
+    depth: Float32Array | None = None
 
 
 def _noise(rng: Rng, shape: tuple[int, ...], sigma: float) -> Float32Array:

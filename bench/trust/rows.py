@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from collections.abc import Iterable, Sequence
@@ -20,6 +21,8 @@ from semdb.localization.confidence import Evidence
 from semdb.localization.verdict import VerdictOptions, judge
 from semdb.types import FloatArray, Localization, Verdict
 
+OFF_M, OFF_DEG = 0.05, 5.0
+BINS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.82, 0.9, 0.95, 0.98, 1.0)  # of confidences, in the table of how often they hold
 COUNTS = ("inliers", "first_inliers", "first_of_best", "rival", "supporters", "second", "class_points")
 
 
@@ -53,6 +56,13 @@ class Row:
         if self.kind == NEGATIVE or self.translation_m is None or self.rotation_deg is None:
             return False
         return self.translation_m <= FALSE_TRANSLATION_M and self.rotation_deg <= FALSE_ROTATION_DEG
+
+    @property
+    def is_off(self) -> bool:
+        """Whether it is localized more than 5 cm or 5 degrees from the truth."""
+        if not self.is_localized or self.kind == NEGATIVE:
+            return self.is_localized
+        return self.translation_m is None or self.translation_m > OFF_M or (self.rotation_deg or 0.0) > OFF_DEG
 
     @property
     def is_localized(self) -> bool:
@@ -131,7 +141,7 @@ def load_rows(path: Path) -> list[Row]:
 
 def report(rows: Sequence[Row]) -> str:
     """Counts per suite, the bars, calibration per half, and how honest the covariance is."""
-    lines = [f"{'suite':34} {'asked':>6} {'localized':>10} {'right':>7} {'false':>6} {'ambiguous':>10}"]
+    lines = [f"{'suite':34} {'asked':>6} {'localized':>10} {'right':>7} {'false':>6} {'off':>5} {'ambiguous':>10}"]
     for kind in (POSITIVE, HARD, NEGATIVE):
         for world in dict.fromkeys(row.world for row in rows):
             for suite in dict.fromkeys(r.suite for r in rows if r.kind == kind and r.world == world):
@@ -142,6 +152,7 @@ def report(rows: Sequence[Row]) -> str:
     for half in dict.fromkeys(row.half for row in rows):
         for world in ("", *dict.fromkeys(row.world for row in rows)):
             lines.append(_calibration(half, world, [r for r in rows if r.half == half and world in ("", r.world)]))
+    lines += _reliability(rows)
     for world in dict.fromkeys(row.world for row in rows):
         lines.append(_honesty(world, [r for r in rows if r.world == world]))
     return "\n".join(lines)
@@ -150,9 +161,10 @@ def report(rows: Sequence[Row]) -> str:
 def _line(name: str, rows: Sequence[Row]) -> str:
     localized = sum(r.is_localized for r in rows)
     false = sum(r.is_false for r in rows)
+    off = sum(r.is_off for r in rows)
     ambiguous = sum(r.verdict == Verdict.AMBIGUOUS for r in rows)
     share = f"{false / len(rows):.2%}" if rows else ""
-    return f"{name:34.34} {len(rows):6} {localized:10} {localized - false:7} {false:6} {ambiguous:10}  {share}"
+    return f"{name:34.34} {len(rows):6} {localized:10} {localized - false:7} {false:6} {off:5} {ambiguous:10}  {share}"
 
 
 def _calibration(half: str, world: str, rows: Sequence[Row]) -> str:
@@ -167,6 +179,28 @@ def _calibration(half: str, world: str, rows: Sequence[Row]) -> str:
         f"{half}{held_out} {world or 'all'}: {len(rows)} queries, {negative:.0%} negative: calibration error "
         f"{shown[0]:.3f} (of those with a confidence {shown[2]:.3f}), AUROC {shown[1]:.4f}"
     )
+
+
+def _reliability(rows: Sequence[Row]) -> list[str]:
+    """How often answers of a confidence are right, in every world, and those of more than 5 cm or 5 degrees."""
+    worlds = list(dict.fromkeys(row.world for row in rows))
+    lines = ["confidence, and how many of those with it are right: " + ", ".join(worlds)]
+    for low, high in itertools.pairwise(BINS):
+        inside = [r for r in rows if r.confidence > 0 and low <= r.confidence and (r.confidence < high or high == 1.0)]
+        parts = []
+        for world in worlds:
+            own = [r for r in inside if r.world == world]
+            parts.append(f"{sum(r.is_right for r in own):5} of {len(own):4}")
+        lines.append(f"{low:.2f} to {high:.2f}  " + "  ".join(parts))
+    for world in worlds:
+        sure = [r for r in rows if r.world == world and r.is_localized]
+        own = [r for r in sure if r.kind != NEGATIVE]
+        off = sum(r.is_off for r in sure)
+        lines.append(
+            f"{world}: {off} of {len(sure)} localized are more than 5 cm or 5 degrees off or of another place "
+            f"({off / max(len(sure), 1):.2%}); {len(own)} of their own place"
+        )
+    return lines
 
 
 def _honesty(world: str, rows: Sequence[Row]) -> str:

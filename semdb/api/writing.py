@@ -203,21 +203,22 @@ class Writing(Reading):
         source: str | PathLike[str] | Sequence[str | PathLike[str]],
         *,
         map: str | None = None,
+        name: str | None = None,
         camera: CameraLike | None = None,
         reading: ReadOptions | None = None,
         progress: Progress | None = None,
     ) -> list[FramesAdded]:
         """Keeps what frames beside the keyframes show, of recordings that were ingested (`semdb refine --frames`).
 
-        `source`, `camera` and `reading` are as for `ingest`; `map` names the map where recordings are in several. What
-        is there of a recording is replaced. Raises UsageError where no map holds a recording, RecordingError where it
-        brings no poses or is another one, ModelError, DatabaseError.
+        `source`, `name`, `camera` and `reading` are as for `ingest`; `map` names the map where recordings are in
+        several. What is there of a recording is replaced. Raises UsageError where no map holds a recording,
+        RecordingError where it brings no poses or is another one, ModelError, DatabaseError.
         """
         from semdb.api.sources import ingest_options, open_source
         from semdb.ingestion.frames import add_frames, map_with
         from semdb.ingestion.run import describers_for
 
-        options = ingest_options(map, None, None, None, camera, reading)
+        options = ingest_options(map, name, None, None, camera, reading)
         found = []
         with open_source(source, self.settings, options, progress, self._check_ingest) as recordings:
             store = self._store()
@@ -228,7 +229,6 @@ class Writing(Reading):
                     _, own = describers_for(info.name, has_masks, store, self.settings, known)
                     dtype = self.settings.descriptor_dtype
                     found.append(add_frames(store, info, recording, own[0], dtype=dtype, progress=progress))
-                self._here.maps().frames_anew()
         return found
 
     def tell_up(self, map: str, up: Sequence[float] | None) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from semdb.cli.options import JsonFlag, Overrides, open_database, settings_options
+from semdb.cli.options import CameraOption, JsonFlag, Overrides, open_database, settings_options
 
 if TYPE_CHECKING:
     from semdb.api.database import Database
@@ -32,6 +32,10 @@ def command(
             help="A recording that was ingested: its other frames are seen from nearer. Nothing else; repeatable.",
         ),
     ] = None,
+    name: Annotated[
+        str | None, typer.Option("--name", metavar="N", help="With --frames: the recording's name in the map.")
+    ] = None,
+    camera: CameraOption = None,
     force: Annotated[bool, typer.Option("--force", help="Also what is up to date.")] = False,
     json: JsonFlag = False,
 ) -> None:
@@ -42,38 +46,44 @@ def command(
     """
     from semdb.cli.output import print_json, print_lines
     from semdb.cli.progress import StagedProgress, say
-    from semdb.errors import DatabaseUnavailableError, SemdbError
+    from semdb.errors import DatabaseUnavailableError, SemdbError, UsageError
     from semdb.refinement.run import steps_of
 
     steps_of(step or ())
     if frames:
-        _add_frames(overrides, map_name, frames, step, up, json)
+        if step or up:
+            raise UsageError("--frames does nothing else: leave out --step and --up")
+        options = {"map": map_name, "name": name, "camera": camera}
+        _add_frames(overrides, [str(path) for path in frames], options, json)
         return
+    given = [option for option, value in (("--name", name), ("--camera", camera)) if value is not None]
+    if given:
+        raise UsageError(f"{' and '.join(given)}: only with --frames, whose recording is read that way")
     done: list[dict[str, Any]] = []
     failed: list[SemdbError] = []
     with open_database(overrides.settings()) as database:
         if up is not None:
             _tell_up(database, map_name, up)
         names = [map_name] if map_name is not None else [info.name for info in database.maps() if info.keyframes]
-        for name in names:
+        for each in names:
             try:
                 with StagedProgress(usual="steps") as progress:
-                    results = database.refine(name, steps=step or (), force=force, progress=progress.update)
+                    results = database.refine(each, steps=step or (), force=force, progress=progress.update)
             except SemdbError as error:
                 if len(names) == 1 or isinstance(error, DatabaseUnavailableError):
                     raise
                 failed.append(error)
-                say(f"{name}: not refined: {error}")
+                say(f"{each}: not refined: {error}")
                 continue
             for result in results:
                 state = "computed" if result.computed else "up to date"
                 if not json:
-                    print_lines(f"{name}: {result.summary}: {result.rows} rows, {state}")
+                    print_lines(f"{each}: {result.summary}: {result.rows} rows, {state}")
                 if not result.current:
-                    say(f"{name}: the map changed meanwhile, so {result.summary} is out of date: run it again")
+                    say(f"{each}: the map changed meanwhile, so {result.summary} is out of date: run it again")
                 done.append(
                     {
-                        "map": name,
+                        "map": each,
                         "step": result.kind,
                         "rows": result.rows,
                         "computed": result.computed,
@@ -88,18 +98,13 @@ def command(
         raise typer.Exit(failed[0].exit_code)
 
 
-def _add_frames(
-    overrides: Overrides, map_name: str | None, paths: list[Path], step: list[str] | None, up: str | None, json: bool
-) -> None:
-    """What frames beside the keyframes show. Raises UsageError."""
+def _add_frames(overrides: Overrides, paths: list[str], options: dict[str, Any], json: bool) -> None:
+    """What frames beside the keyframes show."""
     from semdb.cli.output import print_json, print_lines
     from semdb.cli.progress import StagedProgress, say
-    from semdb.errors import UsageError
 
-    if step or up:
-        raise UsageError("--frames does nothing else: leave out --step and --up")
     with open_database(overrides.settings()) as database, StagedProgress(usual="frames") as progress:
-        found = database.add_frames([str(path) for path in paths], map=map_name, progress=progress.update)
+        found = database.add_frames(paths, **options, progress=progress.update)
     for one in found:
         for line in one.failed:
             say(f"left out: {line}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,13 +15,14 @@ from semdb.database.codecs import decode_descriptors, decode_keypoints, encode_d
 from semdb.database.columns import POSE_COLUMNS
 from semdb.database.engine import check_packet
 from semdb.database.keyframe_rows import FARTHEST_POINT_M, pose_columns, pose_of
+from semdb.database.pose_errors import map_of
 from semdb.database.reading import Bad
+from semdb.database.refinements import FRAMES, replace_refinement
 from semdb.database.tables import cameras, frame_views, keyframes, recordings
 from semdb.database.writing import descriptor_dtype_of
 from semdb.errors import CodecError
 from semdb.types import Camera, FloatArray, Keypoints
 
-FRAMES = "frames"  # the step of `semdb refine`
 CHUNK = 500
 _STATEMENT = 4096  # bytes beside blobs
 _CAMERA = [cameras.c[name] for name in ("width", "height", "fx", "fy", "cx", "cy", "distortion")]
@@ -49,9 +51,27 @@ class FrameRow:
 def write_frame_views(engine: Engine, recording_id: int, found: Sequence[FrameRow], dtype: str = "float32") -> int:
     """Writes the frames of a recording in place of those that are there; `dtype` as of `KeyframeRecord`.
 
-    Returns how many there are now: those of keyframes that were deleted meanwhile are left out.
+    Returns how many there are now: those of keyframes that were deleted meanwhile are left out. Programs that keep the
+    map in memory see by its `refinements` that they are others.
     """
-    return retry.write(engine, lambda connection: _replace(connection, recording_id, found, dtype))
+    map_id = map_of(engine, recording_id)
+    if map_id is None:
+        return 0  # it was deleted meanwhile
+    parameters = {"recording": recording_id, "sha256": _digest(found)}
+    return replace_refinement(
+        engine, map_id, FRAMES, None, parameters, lambda connection: _replace(connection, recording_id, found, dtype)
+    )
+
+
+def _digest(found: Sequence[FrameRow]) -> str:
+    """Tells what is written from what was there."""
+    digest = hashlib.sha256()
+    for one in found:
+        digest.update(f"{one.head.keyframe_id} {one.head.frame_index} ".encode())
+        for part in (one.head.keyframe_from_camera, one.keypoints.points, one.keypoints.features.descriptors):
+            digest.update(np.ascontiguousarray(part).tobytes())
+        digest.update(one.grey)
+    return digest.hexdigest()
 
 
 def _replace(connection: Connection, recording_id: int, found: Sequence[FrameRow], dtype: str) -> int:

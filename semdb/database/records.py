@@ -65,8 +65,9 @@ class ImageKind:
 class MapHead:
     """What a program that keeps a map in memory looks at before each query: equal heads, the same models and steps.
 
-    What happens to the keyframes is not in it; `refined` has a line for each step of `semdb refine` that was run,
-    `measured` one of how far the poses of its recordings are off, which ingest measures after the last keyframe.
+    What happens to the keyframes is not in it; `refined` has a line for each step of `semdb refine` that was run, and
+    one for frames beside the keyframes, `measured` one of how far the poses of its recordings are off, which ingest
+    measures after the last keyframe.
     """
 
     id: int

@@ -26,6 +26,7 @@ from semdb.errors import CodecError, NotFoundError
 from semdb.geometry import FARTHEST_POSE_M
 
 CLASSES, POINTS = "classes", "points"  # kinds: steps of `semdb refine`
+FRAMES = "frames"  # none: says when frames beside keyframes were last written, to programs that keep a map
 CHUNK = 500
 WRITE_CHUNK = 2000
 MICRO = 1_000_000
@@ -65,6 +66,8 @@ def list_refinements(
 ) -> list[Refinement]:
     """The refinements of a map, or of all maps, by map and kind; each says whether the map is still the same.
 
+    Frames beside keyframes are none: they are not out of date when a map grows.
+
     A row that is none is left out and told to `say`, or raises CodecError.
     """
     parameters = checked.up_to(refinements.c.parameters, checked.MOST_JSON)
@@ -72,6 +75,7 @@ def list_refinements(
 
     def work(connection: Connection) -> list[Refinement]:
         query = select(*columns, maps.c.name).join(maps).order_by(refinements.c.map_id, refinements.c.kind)
+        query = query.where(refinements.c.kind != FRAMES)
         if map_id is not None:
             query = query.where(refinements.c.map_id == map_id)
         rows = list(connection.execute(query))

@@ -19,9 +19,10 @@ from semdb.localization.edges import ImageEdges, PlacedEdges
 from semdb.localization.surface_alignment import LONGEST_STEP, SAME_DEG, SAME_M, moved, scatter_of
 from semdb.types import FloatArray
 
-STILL = 1e-4  # metres and radians together
+STILL, STILL_COARSE = 2e-4, 2e-3  # metres and radians together
 COVER_ACROSS = 160  # pixels of the image in which it is told what is hidden
-COARSE_COVER = 2  # every other point will do in coarse rounds
+COARSE_COVER = 2  # every other point will do in coarse rounds,
+FINE = 2  # which take fewer points than every second
 COVER_EVERY = 3  # steps, of fine rounds
 NEAR_PX = 4  # an edge of the query is explained that far from where one is expected
 LEAST_CLEAR = 50  # pixels of the query's edges, fewer say nothing
@@ -45,8 +46,9 @@ class EdgeOptions:
     starts: int = 3  # keyframes from whose poses it is looked for, beside the pose of the keypoints
     keyframes: int = 4  # on which it is laid
     finished: int = 3  # poses that the fine rounds are spent on
-    coarse: tuple[EdgeRound, ...] = (EdgeRound(40, 0.7, 6, 5, 4), EdgeRound(20, 0.8, 4, 5, 4))
-    fine: tuple[EdgeRound, ...] = (EdgeRound(10, 0.85, 2, 6, 1), EdgeRound(5, 0.9, 1.5, 6, 1))
+    far_less: float = 0.25  # hit after coarse rounds: a pose of which so much less is left
+    coarse: tuple[EdgeRound, ...] = (EdgeRound(40, 0.7, 6, 5, 8), EdgeRound(20, 0.8, 4, 5, 5))
+    fine: tuple[EdgeRound, ...] = (EdgeRound(10, 0.85, 2, 6, 2), EdgeRound(5, 0.9, 1.5, 6, 1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,11 +73,15 @@ Near = Callable[[FloatArray], Sequence[PlacedEdges]]  # edges of the keyframes n
 def search_edges(query: ImageEdges, starts: Sequence[FloatArray], near: Near, options: EdgeOptions) -> list[EdgeFit]:
     """Poses at which the query's edges lie well on those of keyframes, from any of `starts` ``[4, 4]``, best first.
 
-    No two are the same; at most `finished` of the options.
+    No two are the same; at most `finished` of the options. One on which far fewer edges lie than on the best after
+    coarse rounds is as these left it.
     """
-    coarse = [fit_edges(query, near(start), start, options.coarse) for start in starts]
+    coarse = _distinct([fit_edges(query, near(start), start, options.coarse) for start in starts])
     fine = []
-    for found in _distinct(coarse)[: options.finished]:
+    for found in coarse[: options.finished]:
+        if found.hit < coarse[0].hit - options.far_less:
+            fine.append(found)
+            continue
         fit = fit_edges(query, near(found.world_from_camera), found.world_from_camera, options.fine)
         if fit is not None:
             fine.append(fit)
@@ -91,9 +97,9 @@ def fit_edges(
     """
     pose, last = start, rounds[-1]
     for now in rounds:
-        nearest = _cover(query, keyframes, pose, 1 if now.every == 1 else COARSE_COVER)
+        nearest = _cover(query, keyframes, pose, 1 if now.every <= FINE else COARSE_COVER)
         for count in range(now.steps):
-            if count and count % COVER_EVERY == 0 and now.every == 1:
+            if count and count % COVER_EVERY == 0 and now.every <= FINE:
                 nearest = _cover(query, keyframes, pose)
             matrix, gradient, _ = _linearise(query, keyframes, pose, now, nearest)
             matrix, gradient = matrix.sum(axis=0), gradient.sum(axis=0)
@@ -101,7 +107,7 @@ def fit_edges(
             step = -np.linalg.solve(matrix + damping, gradient)
             size = float(np.linalg.norm(step))
             pose = moved(pose, step * min(1.0, LONGEST_STEP / max(size, 1e-12)))
-            if size < STILL:
+            if size < (STILL if now.every <= FINE else STILL_COARSE):
                 break
     return measure_edges(query, keyframes, pose, last)
 

@@ -104,12 +104,6 @@ class KeyframeCache:
         with self._turn:
             self._pose_errors = None
 
-    def frames_anew(self) -> None:
-        """Frames beside the keyframes are read again when they are next asked for."""
-        with self._turn:
-            if self._frames is not None:
-                self._frames.forget()
-
     def _forget(self, change: MapChange) -> None:
         if self._refined:
             if self._points == USED:

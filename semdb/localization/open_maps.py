@@ -111,12 +111,6 @@ class OpenMaps:
         for _, index in indexes.values():
             index.close()
 
-    def frames_anew(self) -> None:
-        """Takes over frames beside keyframes that this process has written: they are in no log of changes."""
-        with self._opening:
-            for entry in self._open.values():
-                entry.localizer.cache.frames_anew()
-
     def _tell(self, line: str) -> None:
         """Once: a map that is refused is so for every image."""
         if self._say is not None and line not in self._told:

@@ -19,18 +19,22 @@ from semdb.localization.surfaces import Surfaces
 from semdb.types import FloatArray
 
 LONGEST_STEP = 0.1  # metres and radians together
-STILL = 2e-5
 SAME_M, SAME_DEG = 0.03, 1.5  # poses nearer than this are one
 
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """Some steps on one level: what is further than `gate_m` off is left out, `floor_m` adds to the sensor's noise."""
+    """Some steps on one level: what is further than `gate_m` off is left out, `floor_m` adds to the sensor's noise.
+
+    Every `every`-th point is taken; a step of less than `still` is the last one.
+    """
 
     level: int
     gate_m: float
     floor_m: float
     steps: int
+    every: int = 1
+    still: float = 2e-5  # metres and radians together
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,8 +45,10 @@ class SurfaceOptions:
     keyframes: int = 4  # on which it is laid
     finished: int = 3  # poses that the fine rounds are spent on
     grey_sigma: float = 12.0  # of 255
-    coarse: tuple[Round, ...] = (Round(1, 0.30, 0.02, 8), Round(1, 0.15, 0.01, 8))
-    fine: tuple[Round, ...] = (Round(0, 0.06, 0.004, 6),)
+    followed: int = 4  # poses that go on after the first coarse round
+    far_less: float = 0.25  # of the score after coarse rounds: a pose that lies so much worse than the best is left
+    coarse: tuple[Round, ...] = (Round(1, 0.30, 0.02, 8, 6, 4e-3), Round(1, 0.15, 0.01, 6, 5, 2e-3))
+    fine: tuple[Round, ...] = (Round(0, 0.06, 0.004, 4, 6, 2e-4), Round(0, 0.06, 0.004, 2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,8 +113,11 @@ def fit_surfaces(
     pose = start
     last = rounds[-1]
     tones = np.tile([1.0, 0.0], (len(keyframes), 1))  # gain and bias of each keyframe's grey values
+    level = -1
     for now in rounds:
-        tones = _tones(_linearise(query, keyframes, pose, now, tones, options, use_grey=False)[2], tones)
+        if now.level != level:  # else they are known from the last step
+            tones = _tones(_linearise(query, keyframes, pose, now, tones, options, use_grey=False)[2], tones)
+        level = now.level
         for _ in range(now.steps):
             matrix, gradient, counts = _linearise(query, keyframes, pose, now, tones, options, use_grey=True)
             damping = 1e-6 * float(np.trace(matrix)) / 6 + 1e-6
@@ -116,7 +125,7 @@ def fit_surfaces(
             size = float(np.linalg.norm(step))
             pose = moved(pose, step * min(1.0, LONGEST_STEP / max(size, 1e-12)))
             tones = _tones(counts, tones)
-            if size < STILL:
+            if size < now.still:
                 break
     single = [
         _linearise(query, [keyframe], pose, last, tones[k : k + 1], options, use_grey=True)
@@ -163,7 +172,7 @@ def _linearise(
         source = keyframe.surfaces[at]
         accumulate(
             keyframe.points[at], keyframe.normals[at], source.point_grey, source.point_detail,
-            source.point_variance + now.floor_m**2, target.depth, target.grey, target.detail, target.variance,
+            source.point_variance, now.floor_m**2, now.every, target.depth, target.grey, target.detail, target.variance,
             target.intrinsics, pose,
             now.gate_m, tones[k, 0], tones[k, 1], options.grey_sigma**2, use_grey, matrix, gradient, counts[k],
         )  # fmt: skip

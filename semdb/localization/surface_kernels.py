@@ -61,16 +61,17 @@ def normals_of(depth: Any, fx: float, fy: float, cx: float, cy: float, jump: flo
 
 @kernel
 def accumulate(
-    points: Any, normals: Any, greys: Any, details: Any, variances: Any,
+    points: Any, normals: Any, greys: Any, details: Any, variances: Any, floor: float, every: int,
     depth: Any, grey: Any, detail: Any, depth_variance: Any, intrinsics: Any, world_from_camera: Any,
     gate: float, gain: float, bias: float, grey_variance: float, use_grey: bool,
     matrix: Any, gradient: Any, counts: Any,
 ) -> None:  # fmt: skip
-    """Adds what points of a keyframe say of the query's pose to `matrix` ``[6, 6]`` and `gradient` ``[6]``.
+    """Adds what every `every`-th point of a keyframe says of the query's pose to `matrix` ``[6, 6]``, `gradient`.
 
-    `points`, `normals` ``[n, 3]`` are in the world, `variances` ``[n]`` of their depth along the normal. `depth`
-    (metres) and `grey` are images ``[h, w]`` of the query without distortion, `intrinsics` fx, fy, cx, cy. The
-    unknowns are a translation (m, world) and a rotation (rad, left perturbation in the world, about the camera).
+    `points`, `normals` ``[n, 3]`` are in the world, `variances` ``[n]`` of their depth along the normal, to which
+    `floor` is added. `depth` (metres) and `grey` are images ``[h, w]`` of the query without distortion, `intrinsics`
+    fx, fy, cx, cy. The unknowns are a translation (m, world) and a rotation (rad, left perturbation in the world, about
+    the camera).
     """
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     h, w = depth.shape
@@ -79,7 +80,7 @@ def accumulate(
     r20, r21, r22 = world_from_camera[2, 0], world_from_camera[2, 1], world_from_camera[2, 2]
     tx, ty, tz = world_from_camera[0, 3], world_from_camera[1, 3], world_from_camera[2, 3]
     j = np.zeros(6)
-    for i in range(points.shape[0]):
+    for i in range(0, points.shape[0], every):
         ox, oy, oz = points[i, 0] - tx, points[i, 1] - ty, points[i, 2] - tz
         x = r00 * ox + r10 * oy + r20 * oz
         y = r01 * ox + r11 * oy + r21 * oz
@@ -107,7 +108,7 @@ def accumulate(
             else:
                 counts[THROUGH] += 1
             continue
-        variance = variances[i] + depth_variance[v, u]
+        variance = variances[i] + floor + depth_variance[v, u]
         chi2 = error * error / variance
         weight = 1 / (1 + chi2 / CAUCHY_SQUARED)
         if chi2 < 9:

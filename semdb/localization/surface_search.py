@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from semdb.localization.surface_alignment import PlacedSurfaces, SurfaceFit, SurfaceOptions, distinct, fit_surfaces
+from semdb.localization.surface_alignment import (
+    PlacedSurfaces,
+    Round,
+    SurfaceFit,
+    SurfaceOptions,
+    distinct,
+    fit_surfaces,
+)
 from semdb.localization.surfaces import Surfaces
 from semdb.types import FloatArray
 
@@ -16,14 +23,28 @@ def search_surfaces(
 ) -> list[SurfaceFit]:
     """Poses at which `query` lies well on surfaces of keyframes, from any of `starts` ``[4, 4]``, best score first.
 
-    No two are the same; at most `finished` of the options.
+    No two are the same; at most `finished` of the options. What lies far worse than the best after coarse rounds is as
+    these left it: no fine ones would bring it near.
     """
-    coarse = [fit_surfaces(query, near(start), start, options.coarse, options) for start in starts]
-    groups = distinct([fit for fit in coarse if fit is not None])
-    fine = []
-    for group in groups[: options.finished]:
-        pose = group[0].world_from_camera
-        fit = fit_surfaces(query, near(pose), pose, options.fine, options)
-        if fit is not None:
-            fine.append(fit)
-    return [group[0] for group in distinct(fine)]
+    first, *others = ((one,) for one in options.coarse)
+    fits = [fit_surfaces(query, near(start), start, first, options) for start in starts]
+    for rounds in others:
+        fits = [_from(query, fit, near, rounds, options) for fit in _best(fits)[: options.followed]]
+    coarse, fine = _best(fits), list[SurfaceFit | None]()
+    for fit in coarse[: options.finished]:
+        far = fit.score < coarse[0].score - options.far_less
+        fine.append(fit if far else _from(query, fit, near, options.fine, options))
+    return _best(fine)
+
+
+def _from(
+    query: Surfaces, fit: SurfaceFit, near: Near, rounds: Sequence[Round], options: SurfaceOptions
+) -> SurfaceFit | None:
+    """What further rounds make of a pose."""
+    pose = fit.world_from_camera
+    return fit_surfaces(query, near(pose), pose, rounds, options)
+
+
+def _best(fits: Sequence[SurfaceFit | None]) -> list[SurfaceFit]:
+    """One of each pose, best score first."""
+    return [group[0] for group in distinct([fit for fit in fits if fit is not None])]

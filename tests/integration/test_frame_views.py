@@ -177,6 +177,22 @@ def test_a_map_that_is_open_takes_what_it_has_added(room: Path, url: str, tmp_pa
         assert db.localize(room / entry.name, map="room").inliers > 1.2 * before
 
 
+def test_a_map_that_is_open_elsewhere_takes_them_at_the_next_query(room: Path, url: str, tmp_path: Path) -> None:
+    copy = tmp_path / "copy.sqlite3"
+    shutil.copy(url.removeprefix("sqlite:///"), copy)
+    with open_store(f"sqlite:///{copy}") as store:
+        rows = load_frames(store.engine, load_frame_heads(store.engine, 1))
+        write_frame_views(store.engine, 1, [])
+        entry = open_recording(room).entries[5]
+        with semdb.open(f"sqlite:///{copy}", detector="recorded", encoder="gist", features="surf", threads=1) as db:
+            before = db.localize(room / entry.name, map="room").inliers
+            write_frame_views(store.engine, 1, rows)  # another program
+            assert db.localize(room / entry.name, map="room").inliers > 1.2 * before
+            write_frame_views(store.engine, 1, [])
+            assert db.localize(room / entry.name, map="room").inliers == before
+            assert [step.kind for step in db.status().refinements] == []
+
+
 def test_frames_that_cannot_be_read_are_named(room: Path, url: str, tmp_path: Path) -> None:
     shutil.copytree(room, tmp_path / room.name)
     shutil.copy(url.removeprefix("sqlite:///"), tmp_path / "copy.sqlite3")
@@ -230,6 +246,14 @@ def test_the_command(room: Path, url: str, tmp_path: Path) -> None:
     run = CliRunner().invoke(app, ["refine", "--frames", str(room), "--database-url", f"sqlite:///{copy}"])
     assert run.exit_code == 0, run.output
     assert f"frames beside {KEYFRAMES} keyframes" in run.output
+    for words, said in ((["--name", "other"], "'other'"), (["--camera", "200,200,159.5,119.5"], "its camera")):
+        asked = ["refine", "--frames", str(room), "--map", "room", "--database-url", f"sqlite:///{copy}", *words]
+        run = CliRunner().invoke(app, asked)
+        assert run.exit_code != 0
+        assert said in str(run.exception) + run.output
+    run = CliRunner().invoke(app, ["refine", "--name", "room", "--database-url", f"sqlite:///{copy}"])
+    assert run.exit_code == 2
+    assert "--name: only with --frames" in run.output
     for extra in (["--step", "points"], ["--up", "0,0,1"]):
         run = CliRunner().invoke(app, ["refine", "--frames", str(room), "--database-url", f"sqlite:///{copy}", *extra])
         assert run.exit_code == 2
