@@ -19,6 +19,7 @@ class EdgeVerdictOptions(LaidOptions):
     """A pose is sure when every bound holds."""
 
     fit: EdgeOptions = field(default_factory=EdgeOptions)
+    least_view: float = 0.59  # of the cabinet from its other side up to .56, at right poses from .62 on
     least_support: int = 8  # a thing that is turned by half a turn has most of its edges again
     convinced_confidence: float = 1.1  # never: where keypoints are many and in doubt, equal things have equal edges
     least_seen: int = 200

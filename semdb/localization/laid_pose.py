@@ -13,6 +13,7 @@ from semdb.localization.matching import Matches
 from semdb.localization.pairs import join_pairs, reprojection_px, world_points_of
 from semdb.localization.pose import FirstPose, FirstSupport, PoseEstimate, estimate_pose, image_spread
 from semdb.localization.pose_options import PoseOptions
+from semdb.localization.predicted_view import Windows
 from semdb.localization.surface_alignment import moved
 from semdb.localization.verdict import Judgement
 from semdb.localization.views import KeyframeView, View
@@ -37,6 +38,10 @@ class LaidOptions:
     least_confidence: float = 0.1  # of keypoints at that pose: equal doors of a corridor have .01 to .05 of it
     convinced_likeness: float = 0.65  # where keypoints are many, and yet in doubt: a room of the same shapes shows
     convinced_confidence: float = 0.9  # other textures, which shapes do not see
+    few_support: int = 20  # fewer keypoints, and what keyframes predict from there is looked at,
+    least_view: float = 0.59  # which has to look alike,
+    view_keyframes: int = 6
+    view_windows: int = 1500  # where so much can be compared
     same_m: float = 0.05  # the keypoints' own pose is this one if it is no further off
     same_deg: float = 3.0
 
@@ -158,6 +163,18 @@ def covariance_from(information: FloatArray, scatter: FloatArray, alike: float) 
     """
     loose = np.diag([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])  # nothing is believed to be further off
     return np.asarray(np.linalg.inv(information / alike + loose) + _shared() + SCATTER * scatter)
+
+
+def with_view(laid: LaidPose, seen: Windows, options: LaidOptions, what: str) -> LaidPose:
+    """`laid` in doubt where the query does not look like what is predicted from that pose (`seen`).
+
+    `what` (surfaces, edges) fits there. Of two sides of a cabinet the other one has as many, and keypoints that vouch.
+    """
+    numbers = {**laid.numbers, "laid_view": seen.alike}
+    if seen.alike >= options.least_view or np.count_nonzero(seen.compared) < options.view_windows:
+        return replace(laid, numbers=numbers)
+    doubt = f"where the {what} fit only {seen.alike:.0%} of the image look as the map predicts"
+    return replace(laid, doubts=(*laid.doubts, doubt), fits_well=False, numbers=numbers)
 
 
 def may_overrule(convinced: bool, evidence: Evidence, laid: LaidPose, options: LaidOptions) -> bool:

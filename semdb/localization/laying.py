@@ -10,8 +10,17 @@ from semdb.localization.edge_alignment import measure_edges, search_edges
 from semdb.localization.edge_step import EdgeVerdictOptions, weigh_edges
 from semdb.localization.edges import image_edges
 from semdb.localization.keyframe_cache import KeyframeCache
-from semdb.localization.laid_pose import LaidOptions, LaidPose, estimate_with, is_one, judge_with, may_overrule
+from semdb.localization.laid_pose import (
+    LaidOptions,
+    LaidPose,
+    estimate_with,
+    is_one,
+    judge_with,
+    may_overrule,
+    with_view,
+)
 from semdb.localization.pose import PoseEstimate, find_rival
+from semdb.localization.predicted_view import compare_view, small_view
 from semdb.localization.search import Search, evidence_of
 from semdb.localization.surface_search import search_surfaces
 from semdb.localization.surface_step import SurfaceVerdictOptions, weigh_surfaces, with_edges
@@ -47,7 +56,9 @@ class Laying:
         fits = search_surfaces(surfaces, starts, lambda pose: self.cache.surfaces_near(pose, fit.keyframes), fit)
         limits, accept = self._limits(search), search.accept
         laid = weigh_surfaces(fits, search.query, search.keyframes, search.matches, options, limits, accept)
-        return laid if laid is None or not laid.is_sure else self._seen_with_edges(laid, options, description)
+        if laid is None or not laid.is_sure:
+            return laid
+        return self._seen(self._seen_with_edges(laid, options, description), options, description, "surfaces")
 
     def _seen_with_edges(self, laid: LaidPose, options: SurfaceVerdictOptions, description: Description) -> LaidPose:
         """A pose on surfaces with what the edges of the query say of it: one bare room fits another."""
@@ -70,9 +81,18 @@ class Laying:
         if search.estimate is not None:
             pose = search.estimate.world_from_camera
             own = measure_edges(edges, self.cache.edges_near(pose, fit.keyframes), pose, fit.fine[-1])
-        return weigh_edges(
+        laid = weigh_edges(
             fits, own, search.query, search.keyframes, search.matches, options, self._limits(search), search.accept
         )
+        return laid if laid is None else self._seen(laid, options, description, "edges")
+
+    def _seen(self, laid: LaidPose, options: LaidOptions, description: Description, what: str) -> LaidPose:
+        """A sure pose for which few keypoints vouch, with whether the query looks as keyframes predict from there."""
+        if description.grey is None or not laid.is_sure or laid.support >= options.few_support:
+            return laid
+        query, pose = small_view(description.camera, description.grey), laid.world_from_camera
+        views, _ = self.cache.views_seen_from(pose, query, options.view_keyframes)
+        return with_view(laid, compare_view(query, pose, views), options, what)
 
     def _limits(self, search: Search) -> tuple[float, float]:
         """What standard deviations (m, deg) a pose may have that is sure."""

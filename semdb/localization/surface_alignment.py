@@ -19,6 +19,7 @@ from semdb.localization.surfaces import Surfaces
 from semdb.types import FloatArray
 
 LONGEST_STEP = 0.1  # metres and radians together
+STILL = 2e-5
 SAME_M, SAME_DEG = 0.03, 1.5  # poses nearer than this are one
 
 
@@ -26,7 +27,7 @@ SAME_M, SAME_DEG = 0.03, 1.5  # poses nearer than this are one
 class Round:
     """Some steps on one level: what is further than `gate_m` off is left out, `floor_m` adds to the sensor's noise.
 
-    Every `every`-th point is taken; a step of less than `still` is the last one.
+    Every `every`-th point is taken.
     """
 
     level: int
@@ -34,21 +35,20 @@ class Round:
     floor_m: float
     steps: int
     every: int = 1
-    still: float = 2e-5  # metres and radians together
 
 
 @dataclass(frozen=True, slots=True)
 class SurfaceOptions:
     """`coarse` rounds tell starts apart, `fine` ones finish the best."""
 
-    starts: int = 5  # keyframes from whose poses it is looked for, beside the pose of the keypoints
+    starts: int = 3  # keyframes from whose poses it is looked for, beside the pose of the keypoints
     keyframes: int = 4  # on which it is laid
     finished: int = 3  # poses that the fine rounds are spent on
     grey_sigma: float = 12.0  # of 255
-    followed: int = 4  # poses that go on after the first coarse round
-    far_less: float = 0.25  # of the score after coarse rounds: a pose that lies so much worse than the best is left
-    coarse: tuple[Round, ...] = (Round(1, 0.30, 0.02, 8, 6, 4e-3), Round(1, 0.15, 0.01, 6, 5, 2e-3))
-    fine: tuple[Round, ...] = (Round(0, 0.06, 0.004, 4, 6, 2e-4), Round(0, 0.06, 0.004, 2))
+    followed: int = 3  # poses that go on after the first coarse round
+    far_less: float = 0.2  # of the score after coarse rounds: a pose that lies so much worse than the best is left
+    coarse: tuple[Round, ...] = (Round(1, 0.30, 0.02, 8, 5), Round(1, 0.15, 0.01, 8, 5))
+    fine: tuple[Round, ...] = (Round(0, 0.06, 0.004, 8, 7), Round(0, 0.06, 0.004, 2, 2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,7 +125,7 @@ def fit_surfaces(
             size = float(np.linalg.norm(step))
             pose = moved(pose, step * min(1.0, LONGEST_STEP / max(size, 1e-12)))
             tones = _tones(counts, tones)
-            if size < now.still:
+            if size < STILL:
                 break
     single = [
         _linearise(query, [keyframe], pose, last, tones[k : k + 1], options, use_grey=True)

@@ -12,7 +12,7 @@ from semdb.localization.surface_alignment import SurfaceFit, SurfaceOptions
 from semdb.localization.views import KeyframeView, View
 from semdb.types import FloatArray, Tolerance
 
-POINTS_PER_CELL = 60.0  # whose errors are alike: the depth's own, and of keyframes' poses
+POINTS_PER_CELL = 30.0  # every second; whose errors are alike: the depth's own, and of keyframes' poses
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +26,10 @@ class SurfaceVerdictOptions(LaidOptions):
     least_correlation: float = 0.6
     edges: EdgeOptions = field(default_factory=EdgeOptions)
     least_edges: int = 200  # of the map that should be seen, so that the query's edges tell something
-    least_explained: float = 0.62  # of the query's edges: on the cabinet 0.74 to 1, of bare rooms on others 0.42, 0.50
+    least_explained: float = (
+        0.68  # of the query's edges: on the cabinet 0.74 to 1, of bare rooms on others 0.42 to 0.63
+    )
+    least_view: float = 0.53  # of the cabinet from its other side up to .49, at right poses from .55 on but for one
 
 
 def weigh_surfaces(

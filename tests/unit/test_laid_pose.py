@@ -8,6 +8,7 @@ import pytest
 from semdb.geometry import pose_error, so3_exp
 from semdb.localization.confidence import Evidence, sigmas
 from semdb.localization.edge_alignment import EdgeFit
+from semdb.localization.edge_step import EdgeVerdictOptions
 from semdb.localization.laid_pose import (
     LaidOptions,
     LaidPose,
@@ -17,9 +18,11 @@ from semdb.localization.laid_pose import (
     judge_with,
     may_overrule,
     shared_doubts,
+    with_view,
 )
 from semdb.localization.pairs import join_pairs
 from semdb.localization.pose import PoseEstimate
+from semdb.localization.predicted_view import Windows
 from semdb.localization.surface_step import SurfaceVerdictOptions, with_edges
 from semdb.localization.verdict import Judgement
 from semdb.types import FloatArray, Verdict
@@ -120,3 +123,17 @@ def test_surfaces_are_in_doubt_where_the_image_has_edges_that_the_map_has_not() 
     assert with_edges(sure, measured(0.5, seen=100), options).is_sure  # too few tell nothing
     [doubt] = with_edges(sure, measured(0.5), options).doubts
     assert doubt == "only 50% of the image's edges are in the map where the surfaces fit"
+
+
+@pytest.mark.parametrize(("alike", "count", "is_sure"), [(0.7, 9000, True), (0.5, 9000, False), (0.5, 1000, True)])
+def test_a_laid_pose_is_in_doubt_where_the_map_predicts_another_view(alike: float, count: int, is_sure: bool) -> None:
+    likeness = np.zeros((60, 200), np.float32)
+    compared = np.zeros((60, 200), np.bool_)
+    compared.flat[:count] = True
+    likeness.flat[: round(alike * count)] = 1.0
+    found = with_view(laid(()), Windows(likeness, compared, 0.9), EdgeVerdictOptions(), "edges")
+    assert found.is_sure is is_sure
+    assert found.numbers["laid_view"] == pytest.approx(alike, abs=1e-3)
+    if not is_sure:
+        assert found.doubts == ("where the edges fit only 50% of the image look as the map predicts",)
+        assert not found.fits_well  # nor does it stand against keypoints elsewhere
