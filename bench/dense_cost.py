@@ -27,7 +27,8 @@ from semdb.cli.options import load_settings
 from semdb.evaluation.workspace import evaluation_store
 from semdb.ingestion.run import IngestOptions, ingest_recording
 from semdb.localization.images import make_localizer
-from semdb.localization.localizer import Localizer, LocalizerOptions
+from semdb.localization.localizer import Localizer
+from semdb.localization.localizer_options import LocalizerOptions
 from semdb.perception.describe import describer_from_specs
 from semdb.perception.model_choice import specs_for_ingest
 from semdb.recordings import open_recordings

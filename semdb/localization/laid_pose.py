@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -41,7 +41,8 @@ class LaidOptions:
     few_support: int = 20  # fewer keypoints, and what keyframes predict from there is looked at,
     least_view: float = 0.59  # which has to look alike,
     view_keyframes: int = 6
-    view_windows: int = 1500  # where so much can be compared
+    view_windows: int = 1500  # where so much can be compared;
+    lead_of_view: float = 0.15  # a pose elsewhere from which so much less looks alike is no rival
     same_m: float = 0.05  # the keypoints' own pose is this one if it is no further off
     same_deg: float = 3.0
 
@@ -69,6 +70,7 @@ class LaidPose:
     agrees: str  # what does, for people
     better: str  # what fits better there, for people
     numbers: Mapping[str, float]
+    look: Callable[[FloatArray], Windows] | None = None  # how the query looks from a pose, where that was asked of it
 
     @property
     def is_sure(self) -> bool:
@@ -78,6 +80,14 @@ class LaidPose:
     def confidence(self) -> float:
         """Probability 0..1 that the pose is within 0.25 m and 5 degrees of the truth."""
         return float(1 / (1 + np.exp(-(LOGIT + LOGIT_OF_SUPPORT * np.log1p(self.support)))))
+
+    def looks_better_than(self, world_from_camera: FloatArray, options: LaidOptions) -> bool:
+        """Whether the query clearly looks more as keyframes predict from here than from another pose."""
+        if self.look is None:
+            return False
+        other = self.look(world_from_camera)
+        enough = np.count_nonzero(other.compared) >= options.view_windows
+        return bool(enough and other.alike < self.numbers["laid_view"] - options.lead_of_view)
 
     def is_same(self, world_from_camera: FloatArray, options: LaidOptions) -> bool:
         """Whether another pose is this one."""
@@ -165,14 +175,20 @@ def covariance_from(information: FloatArray, scatter: FloatArray, alike: float) 
     return np.asarray(np.linalg.inv(information / alike + loose) + _shared() + SCATTER * scatter)
 
 
-def with_view(laid: LaidPose, seen: Windows, options: LaidOptions, what: str) -> LaidPose:
+def with_view(
+    laid: LaidPose,
+    seen: Windows,
+    options: LaidOptions,
+    what: str,
+    look: Callable[[FloatArray], Windows] | None = None,
+) -> LaidPose:
     """`laid` in doubt where the query does not look like what is predicted from that pose (`seen`).
 
     `what` (surfaces, edges) fits there. Of two sides of a cabinet the other one has as many, and keypoints that vouch.
     """
     numbers = {**laid.numbers, "laid_view": seen.alike}
     if seen.alike >= options.least_view or np.count_nonzero(seen.compared) < options.view_windows:
-        return replace(laid, numbers=numbers)
+        return replace(laid, numbers=numbers, look=look)
     doubt = f"where the {what} fit only {seen.alike:.0%} of the image look as the map predicts"
     return replace(laid, doubts=(*laid.doubts, doubt), fits_well=False, numbers=numbers)
 

@@ -20,7 +20,7 @@ from semdb.localization.laid_pose import (
     with_view,
 )
 from semdb.localization.pose import PoseEstimate, find_rival
-from semdb.localization.predicted_view import compare_view, small_view
+from semdb.localization.predicted_view import Windows, compare_view, small_view
 from semdb.localization.search import Search, evidence_of
 from semdb.localization.surface_search import search_surfaces
 from semdb.localization.surface_step import SurfaceVerdictOptions, weigh_surfaces, with_edges
@@ -90,9 +90,12 @@ class Laying:
         """A sure pose for which few keypoints vouch, with whether the query looks as keyframes predict from there."""
         if description.grey is None or not laid.is_sure or laid.support >= options.few_support:
             return laid
-        query, pose = small_view(description.camera, description.grey), laid.world_from_camera
-        views, _ = self.cache.views_seen_from(pose, query, options.view_keyframes)
-        return with_view(laid, compare_view(query, pose, views), options, what)
+        query = small_view(description.camera, description.grey)
+
+        def look(pose: FloatArray) -> Windows:
+            return compare_view(query, pose, self.cache.views_seen_from(pose, query, options.view_keyframes)[0])
+
+        return with_view(laid, look(laid.world_from_camera), options, what, look)
 
     def _limits(self, search: Search) -> tuple[float, float]:
         """What standard deviations (m, deg) a pose may have that is sure."""
@@ -120,6 +123,8 @@ def with_laid(
     if laid.is_sure:
         found = estimate_with(laid, search.query, search.keyframes, search.matches, options, search.pose)
         rival = rival_of(search, found)
+        if rival is not None and not convinced and laid.looks_better_than(rival.world_from_camera, options):
+            rival = None  # what is predicted from there is not what the query shows
         anew = evidence_of(search, found, 0 if rival is None else rival.inliers)
         overrule = may_overrule(convinced, anew, laid, options)
         if search.seen is not None:  # what is predicted decides between places

@@ -51,6 +51,16 @@ class SurfaceOptions:
     fine: tuple[Round, ...] = (Round(0, 0.06, 0.004, 8, 7), Round(0, 0.06, 0.004, 2, 2))
 
 
+# every point, for those who have a place for it in time: the frames of a trajectory
+THOROUGH = SurfaceOptions(
+    starts=5,
+    followed=6,
+    far_less=9.0,
+    coarse=(Round(1, 0.30, 0.02, 8), Round(1, 0.15, 0.01, 8)),
+    fine=(Round(0, 0.06, 0.004, 6),),
+)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PlacedSurfaces:
     """Surfaces of a keyframe in the world: points and normals ``[n, 3]`` of each level."""
@@ -134,7 +144,8 @@ def fit_surfaces(
     matrices, gradients, counts = (
         (np.stack(part) for part in zip(*single, strict=True)) if single else [np.zeros(0)] * 3
     )
-    return _fit(pose, matrices, gradients, counts[:, 0]) if single else None
+    # as if every point had been taken
+    return _fit(pose, last.every * matrices, last.every * gradients, counts[:, 0]) if single else None
 
 
 def distinct(fits: Sequence[SurfaceFit]) -> list[list[SurfaceFit]]:

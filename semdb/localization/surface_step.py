@@ -12,7 +12,7 @@ from semdb.localization.surface_alignment import SurfaceFit, SurfaceOptions
 from semdb.localization.views import KeyframeView, View
 from semdb.types import FloatArray, Tolerance
 
-POINTS_PER_CELL = 30.0  # every second; whose errors are alike: the depth's own, and of keyframes' poses
+POINTS_PER_CELL = 60.0  # whose errors are alike: the depth's own, and of keyframes' poses
 
 
 @dataclass(frozen=True, slots=True)

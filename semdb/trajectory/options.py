@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from semdb.localization.bundle import MotionPrior
 from semdb.localization.matching import MatchingOptions
 from semdb.localization.pose_options import PoseOptions
+from semdb.localization.surface_alignment import THOROUGH
 from semdb.localization.surface_step import SurfaceVerdictOptions
 from semdb.localization.verdict import VerdictOptions
 from semdb.threads import cores
@@ -124,7 +125,7 @@ class AdjustmentOptions:
 
 def _where_motion_leads() -> SurfaceVerdictOptions:
     """Fewer keypoints have to vouch than for a query: it is known where the camera was; more has to fit."""
-    return SurfaceVerdictOptions(least_near=0.7, least_support=4)
+    return SurfaceVerdictOptions(fit=THOROUGH, least_near=0.7, least_support=4)
 
 
 @dataclass(frozen=True, slots=True)
