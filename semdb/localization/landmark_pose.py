@@ -107,8 +107,8 @@ class LandmarkPose:
         boxes that only half agree are what another place gives, too.
         """
         sure = (self.sureness - 0.6) / 0.3
-        value = self.score * (2.53 - 1.12 * sure) / 10 + 1.51 * min(max(self.lead, 0.0), 25.0) / 10 - 0.11 * sure
-        value += 2.43 * self.overlap / 5 + 2.84 * self.overlap / max(self.matched, 1) - 8.19
+        value = self.score * (2.53 - 1.12 * sure) / 10 + 1.51 * min(max(self.lead, 0.0), 25.0) / 10 - 0.51 * sure
+        value += 2.43 * self.overlap / 5 + 2.84 * self.overlap / max(self.matched, 1) - 7.79
         return float(1 / (1 + np.exp(-value)))
 
     def doubt(self, options: LandmarkPoseOptions) -> str:
