@@ -16,7 +16,7 @@ PLANNED = FRAMES + 10  # the last frames are not stored yet
 FIRST_KEYFRAME, FIRST_OBJECT = 10_000, 100_000
 OBJECTS = 3
 OF_KEYFRAME = ("keyframe_images", "cnn_vectors", "keypoints", "descriptors")
-OF_OBJECTS = ("objects", "keyframe_categories", "object_features")
+OF_OBJECTS = ("objects", "keyframe_categories", "completed_categories", "object_features")
 QUERY = {
     "image": "query.png",
     "verdict": "failed",
@@ -75,7 +75,10 @@ class _Rows:
                 category = {"category_id": self._categories[(start + frame + ordinal) % len(self._categories)]}
                 object_id = FIRST_OBJECT + (start + frame) * OBJECTS + ordinal
                 self._add("objects", self._sample["objects"], id=object_id, ordinal=ordinal, **key, **category)
-                self._add("keyframe_categories", self._sample["keyframe_categories"], map_id=map_id, **key, **category)
+                shown = {**self._sample["keyframe_categories"], "map_id": map_id, **key, **category}
+                self._add("keyframe_categories", shown)
+                shown.pop("model_id")
+                self._add("completed_categories", shown)
                 features = {"model_id": self._sample["keypoints"]["model_id"], "start": 10 * ordinal, "count": 10}
                 self._add("object_features", features, object_id=object_id)
             self._add("keyframe_changes", {}, map_id=map_id, kind="added", **key)

@@ -36,7 +36,7 @@ def command(
         str | None, typer.Option("--name", metavar="N", help="With --frames: the recording's name in the map.")
     ] = None,
     camera: CameraOption = None,
-    force: Annotated[bool, typer.Option("--force", help="Also what is up to date.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Also what is up to date, and from nothing.")] = False,
     json: JsonFlag = False,
 ) -> None:
     """Compute what needs more than one keyframe: confused classes, better 3D points, landmarks and what is up.

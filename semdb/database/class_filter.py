@@ -9,21 +9,22 @@ from collections.abc import Collection, Mapping, Sequence
 from decimal import Decimal
 from typing import Any
 
-from sqlalchemy import BigInteger, Connection, Engine, func, literal, literal_column, select
+from sqlalchemy import BigInteger, Connection, Engine, Table, func, literal, literal_column, select
 from sqlalchemy.sql.elements import ColumnElement
 
 from semdb.class_score import SCALE, ClassQuery, ClassTerm, Part, class_query
 from semdb.database import retry
 from semdb.database.checked import LARGEST
 from semdb.database.records import ScoredKeyframe
-from semdb.database.tables import categories, keyframe_categories, keyframes, recordings
+from semdb.database.tables import categories, completed_categories, keyframe_categories, keyframes, recordings
 
 CHUNK = 500
-_COLUMNS = {
-    Part.COUNT: "keyframe_categories.count",
-    Part.UPPER: "keyframe_categories.upper_strength",
-    Part.LOWER: "keyframe_categories.lower_strength",
-}
+_COLUMNS = {Part.COUNT: "count", Part.UPPER: "upper_strength", Part.LOWER: "lower_strength"}
+
+
+def classes_of_keyframes(completed: bool) -> Table:
+    """Where the classes of keyframes are: as they were seen, or completed (see `semdb.database.completions`)."""
+    return completed_categories if completed else keyframe_categories
 
 
 def keyframe_count(engine: Engine, map_id: int) -> int:
@@ -68,18 +69,24 @@ def query_for(engine: Engine, map_id: int, counts: Mapping[str, float]) -> Class
 
 
 def class_filter(
-    engine: Engine, map_id: int, query: ClassQuery, minimum_share: float, at_most: int | None = None
+    engine: Engine,
+    map_id: int,
+    query: ClassQuery,
+    minimum_share: float,
+    at_most: int | None = None,
+    completed: bool = False,
 ) -> list[ScoredKeyframe]:
     """Keyframes of a map with a class score of at least `minimum_share`: the best `at_most` of them (None: all).
 
-    Best first, equal ones by id. Keyframes that share no class with the query are never among them.
+    Best first, equal ones by id. Keyframes that share no class with the query are never among them. `completed`: by
+    the classes that landmarks complete, where `completions.completion_of` says that they are to be used.
     """
 
     def work(connection: Connection) -> list[ScoredKeyframe]:
         known = _known(connection, query)
         if not known:
             return []
-        keyframe_id, points = _scores(map_id, query, known)
+        keyframe_id, points = _scores(classes_of_keyframes(completed), map_id, query, known)
         statement = select(keyframe_id, points).where(points >= query.least(minimum_share))
         statement = statement.order_by(points.desc(), keyframe_id).limit(at_most)
         rows = connection.execute(statement)
@@ -96,7 +103,7 @@ def class_scores(engine: Engine, map_id: int, query: ClassQuery, keyframe_ids: S
         known = _known(connection, query)
         found: dict[int, float] = {}
         for start in range(0, len(keys) if known else 0, CHUNK):
-            keyframe_id, points = _scores(map_id, query, known, keys[start : start + CHUNK])
+            keyframe_id, points = _scores(keyframe_categories, map_id, query, known, keys[start : start + CHUNK])
             rows = connection.execute(select(keyframe_id, points).where(points > 0))
             found.update((row[0], int(row[1]) / query.whole) for row in rows if _is_score(row[1], query))
         return found
@@ -125,16 +132,20 @@ def _known(connection: Connection, query: ClassQuery) -> list[tuple[int, ClassTe
 
 
 def _scores(
-    map_id: int, query: ClassQuery, known: list[tuple[int, ClassTerm]], keyframe_ids: Sequence[int] | None = None
+    table: Table,
+    map_id: int,
+    query: ClassQuery,
+    known: list[tuple[int, ClassTerm]],
+    keyframe_ids: Sequence[int] | None = None,
 ) -> tuple[ColumnElement[int], ColumnElement[int]]:
     """Keyframe and points of all keyframes of a map, or of these, that have a row of a class of the query.
 
     The sums are in a subquery, so that a server adds once, however often a condition or an order names them. A
     quotient is taken of what can be divided: servers round each in their own way.
     """
-    c = keyframe_categories.c
+    c = table.c
     ids = sorted({category_id for category_id, _ in known})
-    columns = [c.keyframe_id, func.sum(_contribution(known)).label("shared")]
+    columns = [c.keyframe_id, func.sum(_contribution(table, known)).label("shared")]
     if query.per_held:
         columns.append(func.max(c.keyframe_strength).label("held"))
     rows = select(*columns).where(c.map_id == map_id).group_by(c.keyframe_id)
@@ -142,7 +153,7 @@ def _scores(
         rows = rows.where(c.category_id.in_(ids), c.keyframe_id.in_(keyframe_ids))
     else:
         # Class by class: MariaDB otherwise prefers to read the index entries of all classes of the map.
-        rows = rows.join_from(categories, keyframe_categories, c.category_id == categories.c.id)
+        rows = rows.join_from(categories, table, c.category_id == categories.c.id)
         rows = rows.where(categories.c.id.in_(ids)).prefix_with("STRAIGHT_JOIN", dialect="mysql")
     sums = rows.subquery("sums").c
     if not query.per_held:
@@ -152,7 +163,7 @@ def _scores(
     return sums.keyframe_id, (scaled - scaled % union) // union
 
 
-def _contribution(known: list[tuple[int, ClassTerm]]) -> ColumnElement[int]:
+def _contribution(table: Table, known: list[tuple[int, ClassTerm]]) -> ColumnElement[int]:
     """What one row (category, keyframe) adds: the sum of ``min(full, per_object * value)`` of its parts.
 
     Written out, since expressions for dozens of terms take SQLAlchemy longer to compile than servers to run. All that
@@ -160,10 +171,10 @@ def _contribution(known: list[tuple[int, ClassTerm]]) -> ColumnElement[int]:
     """
     of_category: dict[int, list[str]] = {}
     for category_id, term in known:
-        value, enough = _COLUMNS[term.part], -(-term.full // term.per_object)
+        value, enough = f"{table.name}.{_COLUMNS[term.part]}", -(-term.full // term.per_object)
         # what is no number of objects, on SQLite, is in no range
         added = f"CASE WHEN {value} BETWEEN {enough:d} AND {LARGEST:d} THEN {term.full:d} "
         added += f"WHEN {value} BETWEEN 1 AND {enough:d} THEN {term.per_object:d} * {value} ELSE 0 END"
         of_category.setdefault(int(category_id), []).append(added)
     branches = " ".join(f"WHEN {key:d} THEN {' + '.join(added)}" for key, added in of_category.items())
-    return literal_column(f"CASE keyframe_categories.category_id {branches} ELSE 0 END", BigInteger)
+    return literal_column(f"CASE {table.name}.category_id {branches} ELSE 0 END", BigInteger)

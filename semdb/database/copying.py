@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from sqlalchemy import Connection, Engine, Table, insert, select, union
+from sqlalchemy import Connection, Engine, Table, insert, or_, select
 
 from semdb.database import checked, retry, tables
 from semdb.database.copying_landmarks import copy_landmarks
@@ -34,6 +34,9 @@ LANDMARKS = (
     "landmark_relations",
     "landmark_categories",
     "landmark_merges",
+    "completed_categories",
+    "map_completions",
+    "landmark_parts",
 )
 NOT_COPIED = ("queries", "keyframe_changes", "pose_operations", "pose_revisions", "loop_closures", *LANDMARKS)
 CHUNK = 16  # keyframes that are read at a time
@@ -79,11 +82,9 @@ def copy_map(source: Engine, map_id: int, target: Engine, name: str, *, progress
             f"the map {name!r} was described anew by another encoder while it was copied: remove the copy and start "
             "again"
         )
-    m, c = tables.landmarks.c, tables.landmark_categories.c
-    used = union(
-        select(m.category_id).where(m.map_id == map_id), select(c.category_id).where(c.map_id == map_id)
-    ).scalar_subquery()
-    names = _rows(source, select(tables.categories.c.id).where(tables.categories.c.id.in_(used)))
+    of_map = (tables.landmarks, tables.landmark_categories, tables.completed_categories)
+    used = [tables.categories.c.id.in_(select(t.c.category_id).where(t.c.map_id == map_id)) for t in of_map]
+    names = _rows(source, select(tables.categories.c.id).where(or_(*used)))
     known = retry.write(target, lambda connection: _categories(copy, connection, names))
     copy_landmarks(source, map_id, target, copy.ids["maps"][map_id], known)
     _keep_current(source, map_id, target, copy.ids["maps"][map_id])
@@ -96,12 +97,12 @@ def _encoder(source: Engine, map_id: int) -> int | None:
 
 def _keep_current(source: Engine, map_id: int, target: Engine, target_id: int) -> None:
     """What refinements were computed of is written with ids: those that were current are so in the copy."""
-    f = tables.refinements.c
     before, after = map_state(source, map_id), map_state(target, target_id)
 
     def work(connection: Connection) -> None:
-        same = (f.map_id == target_id, f.map_state == before)
-        connection.execute(tables.refinements.update().where(*same).values(map_state=after))
+        for table in (tables.refinements, tables.map_completions):
+            same = (table.c.map_id == target_id, table.c.map_state == before)
+            connection.execute(table.update().where(*same).values(map_state=after))
 
     retry.write(target, work)
 

@@ -41,6 +41,7 @@ def copy_landmarks(
         )
     }
     recordings = _recordings(source, map_id, target, target_map_id)
+    completed = _completed(source, map_id, keyframes)
 
     def work(connection: Connection) -> None:
         ids: dict[int, int] = {}
@@ -56,6 +57,14 @@ def copy_landmarks(
             row |= {"map_id": target_map_id, "category_id": categories[int(row["category_id"])]}
         for table, found in hanging.items():
             _insert(connection, table, found, ids, objects, recordings)
+        for table, found in completed.items():
+            for row in found:
+                row["map_id"] = target_map_id
+                if "keyframe_id" in row:
+                    row["keyframe_id"] = keyframes[int(row["keyframe_id"])]
+                    row["category_id"] = categories[int(row["category_id"])]
+            for start in range(0, len(found), 500):
+                connection.execute(insert(table), found[start : start + 500])
 
     retry.write(target, work)
 
@@ -85,6 +94,15 @@ def _insert(
         made.append(values)
     for start in range(0, len(made), 500):
         connection.execute(insert(table), made[start : start + 500])
+
+
+def _completed(source: Engine, map_id: int, keyframes: Mapping[int, int]) -> dict[Table, list[dict[str, Any]]]:
+    """What landmarks complete, of the whole map; nothing where some of its keyframes are not copied."""
+    both = (tables.map_completions, tables.completed_categories)
+    found = {table: _rows(source, select(table).where(table.c.map_id == map_id)) for table in both}
+    if any(int(row["keyframe_id"]) not in keyframes for row in found[tables.completed_categories]):
+        return {}
+    return found
 
 
 def _recordings(source: Engine, map_id: int, target: Engine, target_map_id: int) -> dict[int, int]:

@@ -17,10 +17,12 @@ from semdb.database import retry
 from semdb.database.records import ChangeKind, Deleted, ItemState, RecordingState
 from semdb.database.tables import (
     cameras,
+    completed_categories,
     ingest_items,
     keyframe_changes,
     keyframes,
     landmark_merges,
+    landmark_parts,
     landmarks,
     map_models,
     maps,
@@ -118,6 +120,8 @@ def delete_map(engine: Engine, map_id: int, progress: Progress | None = None) ->
     _delete_rows(engine, keyframe_changes.c.map_id, map_id, keyframe_changes.c.id)
     for table, rank in ((landmarks, landmarks.c.id), (landmark_merges, landmark_merges.c.landmark_id)):
         _delete_rows(engine, table.c.map_id, map_id, rank)
+    _delete_rows(engine, landmark_parts.c.map_id, map_id, landmark_parts.c.kind)
+    _delete_rows(engine, completed_categories.c.map_id, map_id, completed_categories.c.category_id)
     _delete_rows(engine, queries.c.map_id, map_id, queries.c.created_at)
     retry.write(engine, lambda c: c.execute(delete(maps).where(maps.c.id == map_id)))
     return Deleted(recordings=len(recording_ids), keyframes=deleted)

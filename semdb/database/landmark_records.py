@@ -92,6 +92,16 @@ class LandmarkRelation:
     score: float
 
 
+@dataclass(frozen=True, slots=True)
+class CompletedClass:
+    """How strongly a keyframe shows a class at least, landmarks included that were missed in it: see `class_score`."""
+
+    keyframe_id: int
+    category: str
+    upper: int
+    lower: int
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkSet:
     """All that is stored of the landmarks of a map."""
@@ -99,6 +109,7 @@ class LandmarkSet:
     landmarks: tuple[LandmarkRow, ...]
     relations: tuple[LandmarkRelation, ...]
     gravity: GravityRow
+    completed: tuple[CompletedClass, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,6 +120,7 @@ class KeyframeObject:
     category: str
     score: float
     mask: bytes
+    height: float = 0.5  # of the middle of its box in the image, 0 at the top to 1 at the bottom
 
 
 @dataclass(frozen=True, slots=True, eq=False)

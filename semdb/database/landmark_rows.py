@@ -10,10 +10,11 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
-from sqlalchemy import Connection, Engine, delete, insert, select, update
+from sqlalchemy import Connection, Engine, delete, insert, literal, select, update
 
 from semdb.database import checked, retry
 from semdb.database.codecs import encode_array
+from semdb.database.completions import STEP, replace_completions
 from semdb.database.ids import new_id
 from semdb.database.landmark_records import (
     GravityRow,
@@ -40,7 +41,8 @@ from semdb.database.tables import (
 )
 from semdb.errors import CodecError
 
-LANDMARKS = "landmarks"  # the step of `semdb refine`
+LANDMARKS = STEP
+NOT_READ = b"-"
 CHUNK = 500
 READ_CHUNK = 16  # keyframes
 VISIT_COUNTS = ("keyframes", "points", "seen", "seen_through", "occluded", "missed")
@@ -60,16 +62,23 @@ class Identities(Protocol):
 Keep = Callable[[Mapping[int, int], Sequence[Sequence[int]]], Identities]
 
 
-def iter_keyframe_depths(engine: Engine, map_id: int, bad: Bad | None = None) -> Iterator[list[KeyframeDepth]]:
+def iter_keyframe_depths(
+    engine: Engine, map_id: int, bad: Bad | None = None, known: Callable[[KeyframeHead], bool] = lambda _: False
+) -> Iterator[list[KeyframeDepth]]:
     """The keyframes of a map by recording's name and frame, in chunks, each read in a transaction of its own.
 
-    One that is deleted meanwhile is left out; a damaged one is told to `bad`, or raises CodecError.
+    One that is deleted meanwhile is left out; a damaged one is told to `bad`, or raises CodecError. Of those that are
+    `known` neither images nor masks are read: they are `NOT_READ`.
     """
     heads = keyframe_heads(engine, map_id=map_id, bad=bad)
     heads.sort(key=lambda head: (head.recording, head.frame_index))
     for start in range(0, len(heads), READ_CHUNK):
         chunk = heads[start : start + READ_CHUNK]
-        images, things = _rows_of(engine, [head.id for head in chunk])
+        light = [head.id for head in chunk if known(head)]
+        images, things = _rows_of(engine, [head.id for head in chunk if head.id not in light])
+        if light:
+            of_light = _rows_of(engine, light, light=True)
+            images, things = images | of_light[0], things | of_light[1]
         found = []
         for head in chunk:
             if head.id not in images:
@@ -83,13 +92,17 @@ def iter_keyframe_depths(engine: Engine, map_id: int, bad: Bad | None = None) ->
         yield found
 
 
-def _rows_of(engine: Engine, keys: Sequence[int]) -> tuple[dict[int, Any], dict[int, list[Any]]]:
+def _rows_of(
+    engine: Engine, keys: Sequence[int], *, light: bool = False
+) -> tuple[dict[int, Any], dict[int, list[Any]]]:
     i, o = keyframe_images.c, objects.c
     rgb, depth = (checked.up_to(column, checked.MOST_FILE) for column in (i.rgb, i.depth))
-    of_images = select(i.keyframe_id, rgb, depth, i.depth_scale, i.depth_registration).where(i.keyframe_id.in_(keys))
     mask = checked.up_to(o.mask, checked.MOST_MASK)
+    if light:
+        rgb, depth, mask = (literal(NOT_READ).label(column.name) for column in (rgb, depth, mask))
+    of_images = select(i.keyframe_id, rgb, depth, i.depth_scale, i.depth_registration).where(i.keyframe_id.in_(keys))
     of_objects = (
-        select(o.id, o.keyframe_id, o.score, mask, categories.c.name)
+        select(o.id, o.keyframe_id, o.score, o.y1, o.y2, mask, categories.c.name)
         .select_from(objects.join(categories, categories.c.id == o.category_id))
         .where(o.keyframe_id.in_(keys))
         .order_by(o.keyframe_id, o.ordinal)
@@ -111,7 +124,7 @@ def _keyframe(head: KeyframeHead, image: Any, things: Sequence[Any]) -> Keyframe
         name = f"objects.mask of object {row.id} (keyframe {head.id})"
         category = checked.text(row.name, f"categories.name of an object {where}")
         score = checked.real(row.score, f"objects.score of object {row.id}", 0.0, 1.0)
-        found.append(KeyframeObject(int(row.id), category, score, checked.blob(row.mask, name)))
+        found.append(KeyframeObject(int(row.id), category, score, checked.blob(row.mask, name), _height(row, head)))
     depth = None if image.depth is None else checked.blob(image.depth, f"keyframe_images.depth {where}")
     return KeyframeDepth(
         id=head.id,
@@ -128,12 +141,21 @@ def _keyframe(head: KeyframeHead, image: Any, things: Sequence[Any]) -> Keyframe
     )
 
 
+def _height(row: Any, head: KeyframeHead) -> float:
+    """Where the middle of an object's box is in the image, 0 at the top to 1 at the bottom."""
+    y1, y2 = (
+        checked.real(getattr(row, name), f"objects.{name} of object {row.id}", -1e6, 1e6) for name in ("y1", "y2")
+    )
+    return (y1 + y2 + 1) / (2 * head.camera.height)
+
+
 def replace_landmarks(connection: Connection, map_id: int, found: LandmarkSet, keep: Keep) -> int:
     """Write the landmarks of a map in place of those that are there, within a transaction. Returns how many."""
     old = _landmark_of_objects(connection, map_id)
     kept = keep(old, [[s.object_id for s in row.sightings] for row in found.landmarks])
     _delete_landmarks(connection, map_id)
     names = {name for row in found.landmarks for name in (row.category, *row.perhaps)}
+    names |= {item.category for item in found.completed}
     known = _category_ids(connection, sorted(names))
     ids: list[int] = []
     told: list[dict[str, Any]] = []
@@ -175,6 +197,7 @@ def replace_landmarks(connection: Connection, map_id: int, found: LandmarkSet, k
     _insert(connection, landmark_categories, perhaps)
     _keep_merges(connection, map_id, {key: ids[number] for key, number in kept.merged.items()}, set(ids))
     set_gravity(connection, map_id, found.gravity)
+    replace_completions(connection, map_id, found.completed, known)
     return len(ids)
 
 

@@ -15,6 +15,7 @@ from sqlalchemy.sql.elements import ColumnElement
 from semdb.class_score import MOST_OBJECTS, Part, word
 from semdb.database import checked, retry
 from semdb.database.blobs import in_bulk
+from semdb.database.class_filter import classes_of_keyframes
 from semdb.database.codecs import decode_vectors
 from semdb.database.exact_sums import exact_sum, whole
 from semdb.database.reading import Bad, by_own_encoder, encoder_id
@@ -97,11 +98,16 @@ class CoarseRows:
 
 
 def coarse_rows(
-    engine: Engine, map_id: int, ids: Int64Array, size: int | None = None, bad: Bad | None = None
+    engine: Engine,
+    map_id: int,
+    ids: Int64Array,
+    size: int | None = None,
+    bad: Bad | None = None,
+    completed: bool = False,
 ) -> CoarseRows:
     """What is there of these keyframes in the map, as of one moment; `size` and `bad` as in `vectors_there`.
 
-    One that was moved into another map is not there.
+    One that was moved into another map is not there. `completed`: their classes as landmarks complete them.
     """
 
     def work(connection: Connection) -> tuple[list[tuple[int, bytes]], list[int], list[tuple[int, str, int]]]:
@@ -110,13 +116,14 @@ def coarse_rows(
         asked = np.unique(ids).tolist()
         here = [key for keys in _in_chunks(asked) for key in connection.execute(mine.where(k.id.in_(keys))).scalars()]
         wanted = np.array(sorted(here), np.int64)
-        c = keyframe_categories.c
+        c = classes_of_keyframes(completed).c
+        own = [c.map_id == map_id] if completed else []  # rows of before it was moved into this map
         values = (c.count, c.upper_strength, c.lower_strength)
         query = select(c.keyframe_id, categories.c.name, *values).join(categories, categories.c.id == c.category_id)
         shown = [
             (int(key), word(str(name), part), number)
             for keys in _in_chunks(wanted.tolist())
-            for key, name, *numbers in connection.execute(query.where(c.keyframe_id.in_(keys)))
+            for key, name, *numbers in connection.execute(query.where(c.keyframe_id.in_(keys), *own))
             for part, number in zip(Part, map(_held, numbers), strict=True)
             if number
         ]
@@ -131,19 +138,21 @@ def coarse_rows(
 
 
 def map_categories(engine: Engine, map_id: int) -> list[tuple[int, str]]:
-    """Ids and names of the classes that keyframes of a map show, by id."""
+    """Ids and names of the classes that keyframes of a map show, by id; landmarks complete them by no other class."""
     c = keyframe_categories.c
     shown = select(c.keyframe_id).where(c.map_id == map_id, c.category_id == categories.c.id).exists()
     query = select(categories.c.id, categories.c.name).where(shown).order_by(categories.c.id)
     return retry.read(engine, lambda connection: [(int(key), str(name)) for key, name in connection.execute(query)])
 
 
-def category_columns(engine: Engine, map_id: int, category_id: int) -> tuple[Int64Array, dict[Part, Int64Array]]:
+def category_columns(
+    engine: Engine, map_id: int, category_id: int, completed: bool = False
+) -> tuple[Int64Array, dict[Part, Int64Array]]:
     """Keyframes of a map that show a class ``[n]``, ascending, and how many objects, and how strongly, each ``[n]``.
 
-    More than `MOST_OBJECTS` count as so many. Read in several transactions.
+    More than `MOST_OBJECTS` count as so many. `completed`: as landmarks complete them. Read in several transactions.
     """
-    c = keyframe_categories.c
+    c = classes_of_keyframes(completed).c
     base = MOST_OBJECTS + 1
     packed = c.keyframe_id * base + _at_most(c.count)
     packed = (packed * base + _at_most(c.upper_strength)) * base + _at_most(c.lower_strength)
@@ -218,9 +227,12 @@ class MapSums:
     numbers: int  # the sum of their numbers
 
 
-def map_sums(engine: Engine, map_id: int) -> MapSums:
-    """The sums over a map; more than `MOST_OBJECTS` of a class count as so many. Reads two indexes to the end."""
-    c = keyframe_categories.c
+def map_sums(engine: Engine, map_id: int, completed: bool = False) -> MapSums:
+    """The sums over a map; more than `MOST_OBJECTS` of a class count as so many. Reads two indexes to the end.
+
+    `completed`: of the classes that landmarks complete.
+    """
+    c = classes_of_keyframes(completed).c
     frames = select(func.count(), *exact_sum(engine, keyframes.c.id))
     frames = frames.select_from(keyframes.join(recordings)).where(recordings.c.map_id == map_id)
     values = (c.count, c.upper_strength, c.lower_strength)

@@ -12,6 +12,7 @@ from semdb.class_score import ClassQuery, Part
 from semdb.database import (
     change_log,
     class_filter,
+    completions,
     deletion,
     lookups,
     planning,
@@ -190,10 +191,19 @@ class Store:
         return class_filter.query_for(self.engine, map_id, counts)
 
     def class_filter(
-        self, map_id: int, query: ClassQuery, minimum_share: float, at_most: int | None = None
+        self,
+        map_id: int,
+        query: ClassQuery,
+        minimum_share: float,
+        at_most: int | None = None,
+        completed: bool = False,
     ) -> list[ScoredKeyframe]:
         """Keyframes that show enough of the query's classes, best first: see `semdb.database.class_filter`."""
-        return class_filter.class_filter(self.engine, map_id, query, minimum_share, at_most)
+        return class_filter.class_filter(self.engine, map_id, query, minimum_share, at_most, completed)
+
+    def completion_of(self, map_id: int) -> str | None:
+        """The state of a map that its `completed` classes belong to; None where they are not to be used."""
+        return completions.completion_of(self.engine, map_id)
 
     def class_scores(self, map_id: int, query: ClassQuery, keyframe_ids: Sequence[int]) -> dict[int, float]:
         """Class scores of these keyframes; those that share no class with the query are left out."""
@@ -296,10 +306,15 @@ class Store:
         return change_log.change_text(self.engine, map_id, change_id)
 
     def coarse_rows(
-        self, map_id: int, keyframe_ids: Int64Array, size: int | None = None, bad: Bad | None = None
+        self,
+        map_id: int,
+        keyframe_ids: Int64Array,
+        size: int | None = None,
+        bad: Bad | None = None,
+        completed: bool = False,
     ) -> scanning.CoarseRows:
         """Vectors and class counts of those keyframes that the map has, at one moment: see `scanning.coarse_rows`."""
-        return scanning.coarse_rows(self.engine, map_id, keyframe_ids, size, bad)
+        return scanning.coarse_rows(self.engine, map_id, keyframe_ids, size, bad, completed)
 
     def say_class_rows_that_are_none(self, map_id: int) -> None:
         """Says which keyframes of a map have objects per class that are no numbers, and count as none."""
@@ -311,13 +326,15 @@ class Store:
         """Ids and names of the classes that keyframes of a map show."""
         return scanning.map_categories(self.engine, map_id)
 
-    def category_columns(self, map_id: int, category_id: int) -> tuple[Int64Array, dict[Part, Int64Array]]:
+    def category_columns(
+        self, map_id: int, category_id: int, completed: bool = False
+    ) -> tuple[Int64Array, dict[Part, Int64Array]]:
         """Keyframes of a map that show a class, ascending, and how many objects, and how strongly."""
-        return scanning.category_columns(self.engine, map_id, category_id)
+        return scanning.category_columns(self.engine, map_id, category_id, completed)
 
-    def map_sums(self, map_id: int) -> scanning.MapSums:
+    def map_sums(self, map_id: int, completed: bool = False) -> scanning.MapSums:
         """Sums over a map that a mirror of it must have too."""
-        return scanning.map_sums(self.engine, map_id)
+        return scanning.map_sums(self.engine, map_id, completed)
 
     def map_identity(self, map_id: int) -> str:
         """A map's name and when it was made; empty where there is none."""

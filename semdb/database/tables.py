@@ -159,6 +159,22 @@ keyframe_categories = table(
     Index("ix_keyframe_categories_filter", "map_id", "category_id", "keyframe_id", "count", *STRENGTH_COLUMNS),
 )
 
+# As keyframe_categories, with what keyframes should have seen by landmarks. A map has rows of all keyframes, or none.
+completed_categories = table(
+    "completed_categories",
+    reference("map_id", "maps.id", primary_key=True),
+    reference("category_id", "categories.id", cascade=False, primary_key=True, index=True),
+    reference("keyframe_id", "keyframes.id", primary_key=True, index=True),
+    *(Column(name, Integer, nullable=False) for name in ("count", *STRENGTH_COLUMNS)),
+    Index("ix_completed_categories_filter", "map_id", "category_id", "keyframe_id", "count", *STRENGTH_COLUMNS),
+)
+
+map_completions = table(
+    "map_completions",
+    reference("map_id", "maps.id", primary_key=True),
+    Column("map_state", String(NAME_LENGTH), nullable=False),
+)
+
 keypoints = table(
     "keypoints",
     reference("keyframe_id", "keyframes.id", primary_key=True),
@@ -415,6 +431,15 @@ landmark_merges = table(
     Column("landmark_id", Id, primary_key=True, autoincrement=False),
     reference("map_id", "maps.id", index=True),
     Column("merged_into", Id, nullable=False),
+)
+
+landmark_parts = table(  # what refine remembers; it may be deleted at any time
+    "landmark_parts",
+    reference("map_id", "maps.id", primary_key=True),
+    Column("kind", String(16), primary_key=True),
+    Column("name", String(40), primary_key=True),
+    Column("size", Integer, nullable=False),
+    Column("data", Blob, nullable=False),
 )
 
 access_tokens = table(  # never shown to those who ask with SQL

@@ -16,11 +16,13 @@ from semdb.landmarks.appearance import mean_colours
 from semdb.landmarks.boxes import shared_volume
 from semdb.landmarks.clustering import UNIT, clusters
 from semdb.landmarks.evidence import fuse, name_probabilities
+from semdb.landmarks.expected import expected_views
 from semdb.landmarks.gravity import Gravity, estimate_gravity
 from semdb.landmarks.lift import LiftedKeyframe
 from semdb.landmarks.links import find_links, sighting_table, weights
+from semdb.landmarks.memo import Forgetful, Memo
 from semdb.landmarks.options import LandmarkOptions
-from semdb.landmarks.register import registered
+from semdb.landmarks.places import agreed
 from semdb.landmarks.shape import thing_box, thing_points
 from semdb.landmarks.values import BestView, Landmark, Landmarks, LandmarkState, Member
 from semdb.landmarks.visibility import IN_VIEW, THROUGH, VISIBLE, Sightings, Views, collect, look
@@ -55,27 +57,26 @@ def find_landmarks(
     up: FloatArray | None = None,
     options: LandmarkOptions | None = None,
     progress: Progress | None = None,
+    memo: Memo | None = None,
 ) -> Landmarks:
     """The landmarks of a map, of its keyframes by recording's name and frame.
 
     `confusion` ``[classes, classes]``: shares of what goes by another name (see `evidence.name_probabilities`). `up`
-    ``[3]``: which way is up, where that is known.
+    ``[3]``: which way is up, where that is known. `memo`: what was found before, of keyframes that have names.
     """
-    options = options or LandmarkOptions()
+    options, memo = options or LandmarkOptions(), memo or Forgetful()
     lifted = [frame.lifted for frame in keyframes]
-    agreed = registered(lifted, options.register)
-    poses, apart = agreed.poses, np.nan_to_num(agreed.apart, nan=UNKNOWN_APART_M)
-    moved = [float(np.linalg.norm(p[:3, 3] - f.world_from_camera[:3, 3])) for p, f in zip(poses, lifted, strict=True)]
-    lifted = [
-        replace(frame, world_from_camera=pose, apart=float(off))
-        for frame, pose, off in zip(lifted, poses, apart, strict=True)
+    before, lifted = lifted, agreed(lifted, options.register, memo, UNKNOWN_APART_M)
+    moved = [
+        float(np.linalg.norm(frame.world_from_camera[:3, 3] - was.world_from_camera[:3, 3]))
+        for frame, was in zip(lifted, before, strict=True)
     ]
-    gravity = estimate_gravity(lifted, up)
+    gravity = estimate_gravity(lifted, up, memo)
     sightings = collect(lifted)
-    views = look(lifted, sightings, options.see, progress)
+    views = look(lifted, sightings, options.see, progress, memo)
     names = name_probabilities(classes, confusion)
     cluster = associate(keyframes, lifted, sightings, views, names, options)
-    found = _Assembly(keyframes, lifted, sightings, views, cluster, names, gravity, options)
+    found = _Assembly(keyframes, lifted, sightings, views, cluster, names, gravity, options, memo)
     landmarks = found.all()
     objects = sum(len(frame.category) for frame in keyframes)
     placed = sum(len(thing.members) for thing in landmarks)
@@ -136,7 +137,9 @@ class _Assembly:
         names: FloatArray,
         gravity: Gravity,
         options: LandmarkOptions,
+        memo: Memo,
     ) -> None:
+        self._memo = memo
         self._keyframes, self._lifted, self._sightings = keyframes, lifted, sightings
         self._names, self._gravity, self._options = names, gravity, options
         order = np.argsort(cluster, kind="stable")
@@ -183,10 +186,12 @@ class _Assembly:
         reach = np.array([float(np.linalg.norm(things[root].box.size)) for root in roots])
         found = []
         mixed = np.maximum(self._names, self._names.T)
-        for a, b in cKDTree(centres).query_pairs(float(reach.max())):
+        longest = np.array([float(things[root].box.size.max()) for root in roots])
+        pairs = cKDTree(centres).query_pairs(float(reach.max()), output_type="ndarray")
+        away = np.linalg.norm(centres[pairs[:, 0]] - centres[pairs[:, 1]], axis=1)
+        pairs = pairs[away <= (longest[pairs[:, 0]] + longest[pairs[:, 1]]) / 2]
+        for a, b in pairs.tolist():
             one, other = things[roots[min(a, b)]], things[roots[max(a, b)]]
-            if np.linalg.norm(one.box.centre - other.box.centre) > (one.box.size.max() + other.box.size.max()) / 2:
-                continue
             known = {member.keyframe for member in one.members}
             if any(member.keyframe in known for member in other.members):
                 continue
@@ -201,9 +206,9 @@ class _Assembly:
         """The landmark of the sightings of a cluster."""
         rows, options = self._rows[root], self._options
         members = self._members(rows)
-        points = thing_points(self._lifted, members, options.shape)
+        points = thing_points(self._lifted, members, options.shape, self._memo)
         self._points[root] = points
-        box = thing_box(self._lifted, members, points, self._gravity.up, options.shape)
+        box = thing_box(self._lifted, members, points, self._gravity.up, options.shape, self._memo)
         objects = [(k, int(o)) for k, s in sorted(members.items()) for one in sorted(s) for o in self._ordinals(k, one)]
         objects.sort()
         category = np.array([self._keyframes[k].category[o] for k, o in objects], np.int64)
@@ -234,6 +239,7 @@ class _Assembly:
             state=state,
             views=self._best_views(listed, box.centre),
             colours=self._colours(rows),
+            expected=expected_views(self._lifted, points, {k: shares[k][1] for k in missed}),
         )
 
     def _members(self, rows: Int64Array) -> dict[int, list[int]]:
@@ -255,6 +261,7 @@ class _Assembly:
             (self._points[root], thing.box),
             self._gravity.up,
             (options.shape, options.visit),
+            self._memo,
         )
         after = [v for v in visits if self._is_later(self._first_of(v.recording), thing.last)]
         gone = any(visit.presence is Presence.ABSENT for visit in after)
@@ -273,20 +280,18 @@ class _Assembly:
 
         A sighting says nothing of its own keyframe, unless it is the only one.
         """
-        found: dict[int, list[int]] = {}
-        views = self._views
-        for row in rows.tolist():
-            span = slice(self._first_view[row], self._first_view[row + 1])
-            total, home = int(self._sightings.count[row]), int(self._sightings.keyframe[row])
-            for keyframe, seen, own in zip(
-                views.keyframe[span].tolist(), views.seen[span].tolist(), self._own[span].tolist(), strict=True
-            ):
-                if keyframe == home and len(rows) > 1:
-                    continue
-                sums = found.setdefault(keyframe, [0, 0, 0, 0, 0])
-                for k, value in enumerate((total, seen[IN_VIEW], seen[VISIBLE], seen[THROUGH], own)):
-                    sums[k] += value
-        return {k: (s[0], s[1], s[2], s[3], s[4]) for k, s in found.items()}
+        views, sightings = self._views, self._sightings
+        start, stop = self._first_view[rows], self._first_view[rows + 1]
+        row = np.repeat(rows, stop - start)
+        at = np.concatenate([np.arange(a, b) for a, b in zip(start.tolist(), stop.tolist(), strict=True)])
+        others = (views.keyframe[at] != sightings.keyframe[row]) | (len(rows) == 1)
+        row, at = row[others], at[others]
+        keyframes, place = np.unique(views.keyframe[at], return_inverse=True)
+        seen = views.seen[at]
+        values = (sightings.count[row], seen[:, IN_VIEW], seen[:, VISIBLE], seen[:, THROUGH], self._own[at])
+        sums = np.zeros((len(keyframes), len(values)), np.int64)
+        np.add.at(sums, place, np.stack(values, axis=1))
+        return {k: (a, b, c, d, e) for k, (a, b, c, d, e) in zip(keyframes.tolist(), sums.tolist(), strict=True)}
 
     def _elsewhere(
         self, seen: dict[int, tuple[int, int, int, int, int]], members: dict[int, list[int]]

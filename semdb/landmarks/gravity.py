@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from semdb.landmarks.lift import LiftedKeyframe
+from semdb.landmarks.memo import Arrays, Forgetful, Memo, remembered
 from semdb.landmarks.options import RegisterOptions
 from semdb.landmarks.register import surface_of
 from semdb.types import FloatArray
 
+SURFACE = "surface"  # kind of what is remembered
 UPRIGHT = 0.3  # length of the mean of the cameras' up: less, and they were rolled all ways
 WITHIN = 0.6  # cosine: so far from the cameras' mean up that up may be, 53 degrees
 LEVEL = 0.97  # cosine: a surface that is level, 14 degrees
 FLOOR_SHARE = 0.1  # of the level surface below the cameras that a floor has at least
 _BIN = 0.02
 _CANDIDATES, _TRIED = 300, 4  # directions of surfaces that are looked at, and of the best ones made exact
-_MOST_POINTS = 400  # of a keyframe
+_MOST_POINTS, _MOST_OF_MAP = 400, 60_000  # of a keyframe, of all
+_FINEST = 2.0**-9  # a tenth of a degree
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,32 +40,54 @@ class Gravity:
     given: bool = False  # told, not estimated
 
 
-def estimate_gravity(lifted: Sequence[LiftedKeyframe], up: FloatArray | None = None) -> Gravity:
+def estimate_gravity(
+    lifted: Sequence[LiftedKeyframe], up: FloatArray | None = None, memo: Memo | None = None
+) -> Gravity:
     """Up and floor of the map; `up` where it is known. Without depth up is that of the cameras, of certainty 0."""
     poses = np.array([frame.world_from_camera for frame in lifted], np.float64).reshape(-1, 4, 4)
-    points, normals = _surfaces(lifted, poses)
+    points, normals = _surfaces(lifted, poses, memo or Forgetful())
     if up is not None:
         direction, certainty = np.asarray(up, np.float64) / np.linalg.norm(up), 1.0
     else:
         direction, certainty = _direction(poses, normals)
+        direction = on_lattice(direction)
     floor, share = _floor(poses, points, normals, direction)
     return Gravity(direction, certainty, floor, share, up is not None)
 
 
-def _surfaces(lifted: Sequence[LiftedKeyframe], poses: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _surfaces(lifted: Sequence[LiftedKeyframe], poses: FloatArray, memo: Memo) -> tuple[FloatArray, FloatArray]:
     """Points and normals ``[n, 3]`` in the map; as many of each square metre, whatever its distance."""
     points, normals = [np.empty((0, 3))], [np.empty((0, 3))]
     for frame, pose in zip(lifted, poses, strict=True):
-        surface = surface_of(frame, RegisterOptions())
-        if not len(surface.points):
-            continue
-        area = surface.points[:, 2] ** 2 / np.maximum(np.abs(surface.normals[:, 2]), 0.2)
-        ends = np.cumsum(area)
-        wanted = min(_MOST_POINTS, len(area))
-        taken = np.unique(np.searchsorted(ends, (np.arange(wanted) + 0.5) / wanted * ends[-1]).clip(0, len(area) - 1))
-        points.append(surface.points[taken] @ pose[:3, :3].T + pose[:3, 3])
-        normals.append(surface.normals[taken] @ pose[:3, :3].T)
+        own = functools.partial(_surface, frame)
+        found = remembered(memo, SURFACE, frame.name, own) if frame.name else own()
+        count = len(found["points"])
+        wanted = min(count, max(1, _MOST_OF_MAP // len(lifted)))
+        taken = np.arange(wanted) * count // max(wanted, 1)
+        points.append(found["points"][taken] @ pose[:3, :3].T + pose[:3, 3])
+        normals.append(found["normals"][taken] @ pose[:3, :3].T)
     return np.concatenate(points), np.concatenate(normals)
+
+
+def on_lattice(direction: FloatArray) -> FloatArray:
+    """The direction nearby whose parts are multiples of `_FINEST` but for its length.
+
+    More keyframes find another one by less than it is good for: boxes that stand upright by it stay as they are.
+    """
+    whole = np.round(direction / _FINEST)
+    return np.asarray(whole / np.linalg.norm(whole), np.float64)
+
+
+def _surface(frame: LiftedKeyframe) -> Arrays:
+    """Points and normals ``[n, 3]`` of one keyframe, in its camera frame."""
+    surface = surface_of(frame, RegisterOptions())
+    if not len(surface.points):
+        return {"points": np.empty((0, 3)), "normals": np.empty((0, 3))}
+    area = surface.points[:, 2] ** 2 / np.maximum(np.abs(surface.normals[:, 2]), 0.2)
+    ends = np.cumsum(area)
+    wanted = min(_MOST_POINTS, len(area))
+    taken = np.unique(np.searchsorted(ends, (np.arange(wanted) + 0.5) / wanted * ends[-1]).clip(0, len(area) - 1))
+    return {"points": surface.points[taken], "normals": surface.normals[taken]}
 
 
 def _direction(poses: FloatArray, normals: FloatArray) -> tuple[FloatArray, float]:

@@ -4,7 +4,7 @@
 # mypy: disable-error-code="no-untyped-call"
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,29 +32,54 @@ class SeenObject:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Grids:
+    """What is large of a lifted keyframe."""
+
+    outline: tuple[Float32Array, ...]  # of each sighting [j, 3] camera frame: all of the mask, its rim at inner depth
+    depth: Float32Array  # [h, w] metres, 0 where unknown
+    owner: Labels  # [h, w]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class LiftedKeyframe:
     """What one keyframe says: its sightings, and its depth and masks reduced to a grid.
 
     A sighting is one mask, or several masks of one keyframe that are the same but for their names. Label 0 of the grid
-    is the background, label k + 1 sighting k; where masks overlap the smallest one is seen.
+    is the background, label k + 1 sighting k; where masks overlap the smallest one is seen. What is large is loaded
+    when it is first asked for, where it is remembered.
     """
 
     camera: Camera
     world_from_camera: FloatArray  # [4, 4]
     sighting_of: Int64Array  # [objects] sighting of each object, by ordinal
     points: tuple[Float32Array, ...]  # of each sighting [k, 3] camera frame, away from edges; empty: it has no place
-    outline: tuple[Float32Array, ...]  # of each sighting [j, 3] camera frame: all of the mask, its rim at inner depth
     areas: Int64Array  # [sightings] pixels
     beside: BoolArray  # [sightings, sightings] both seen, and apart: they are two things
     cut: BoolArray  # [sightings] touches the rim of the image
-    grid_depth: Float32Array  # [h, w] metres, 0 where unknown
-    grid_owner: Labels  # [h, w]
+    grids: Callable[[], Grids]
     step: int  # pixels from one cell of the grid to the next; the first is at pixel ``step // 2``
     noise: float  # of its depth, as a multiple of `depth_noise`
     single: (
         FloatArray  # [sightings] share of the outline whose depth is that of one pixel, and of no plane through some
     )
     apart: float = 0.0  # metres, a deviation: how far its surfaces lie off those of its neighbours
+    name: str = ""  # of all that it was made from, but for its pose (see `memo`)
+    key: str = ""  # of that, the pose and `apart`
+
+    @property
+    def outline(self) -> tuple[Float32Array, ...]:
+        """As `Grids.outline`."""
+        return self.grids().outline
+
+    @property
+    def grid_depth(self) -> Float32Array:
+        """As `Grids.depth`."""
+        return self.grids().depth
+
+    @property
+    def grid_owner(self) -> Labels:
+        """As `Grids.owner`."""
+        return self.grids().owner
 
 
 def lift_keyframe(
@@ -118,17 +143,17 @@ def lift_keyframe(
             single[k] = 1 - np.mean(planes)
     step = max(1, shape[1] // see.grid)
     half = step // 2
+    cells = (slice(half, None, step), slice(half, None, step))
+    grids = Grids(tuple(outline), np.ascontiguousarray(known[cells]), np.ascontiguousarray(owner[cells]))
     return LiftedKeyframe(
         camera=camera,
         world_from_camera=np.asarray(world_from_camera, np.float64),
         sighting_of=sighting_of,
         points=tuple(points),
-        outline=tuple(outline),
         areas=areas,
         beside=apart(masks, areas),
         cut=cut,
-        grid_depth=np.ascontiguousarray(known[half::step, half::step]),
-        grid_owner=np.ascontiguousarray(owner[half::step, half::step]),
+        grids=lambda: grids,
         step=step,
         noise=noise,
         single=single,

@@ -9,7 +9,7 @@ classes that contain (VLA-3D), distance of boxes for nearness. docs/landmarks.md
 # mypy: disable-error-code="no-untyped-call"
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -17,9 +17,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from semdb.landmarks.boxes import footprint, shared_area, upright_axes
+from semdb.landmarks.memo import Arrays, Forgetful, Memo, name_of, remembered
 from semdb.landmarks.values import Landmark, LandmarkState
 from semdb.types import FloatArray
 
+RELATED = "related"  # kind of what is remembered
 FLOOR_SCORE = 0.3  # relations of less are no rows
 NEAR_M = 1.0  # boxes so far apart are near with a score of one half
 NEXT_M = 0.35
@@ -80,9 +82,14 @@ class _Standing:
 
 
 def find_relations(
-    landmarks: Sequence[Landmark], names: Sequence[str], up: FloatArray, floor_score: float = FLOOR_SCORE
+    landmarks: Sequence[Landmark],
+    names: Sequence[str],
+    up: FloatArray,
+    floor_score: float = FLOOR_SCORE,
+    memo: Memo | None = None,
 ) -> list[Related]:
     """All relations between landmarks that are not gone, by numbers and kind. `names` are those of the classes."""
+    memo = memo or Forgetful()
     there = [k for k, thing in enumerate(landmarks) if thing.state is not LandmarkState.GONE]
     if len(there) < 2:
         return []
@@ -94,12 +101,43 @@ def find_relations(
     tree = cKDTree(centres)
     for row, k in enumerate(there):
         near = tree.query_ball_point(centres[row], halves[row] + float(halves.max()) + REACH_M)
+        others = []
         for other in sorted(near):
             apart = float(np.linalg.norm(centres[row] - centres[other])) - halves[row] - halves[other]
-            if other <= row or apart > REACH_M:
-                continue
-            found += _pair(k, standing[k], there[other], standing[there[other]], floor_score)
+            if other > row and apart <= REACH_M:
+                others.append(there[other])
+        found += _related(k, others, standing, floor_score, memo)
     return sorted(found, key=lambda item: (item.one, item.other, item.kind))
+
+
+def _related(
+    k: int, others: Sequence[int], standing: Mapping[int, _Standing], least: float, memo: Memo
+) -> list[Related]:
+    """The relations of thing `k` with those of higher numbers that are near it."""
+
+    def compute() -> Arrays:
+        place = {number: row for row, number in enumerate((k, *others))}
+        found = [one for n in others for one in _pair(k, standing[k], n, standing[n], least)]
+        kinds = list(Relation)
+        rows = [(place[one.one], kinds.index(one.kind), place[one.other]) for one in found]
+        return {
+            "rows": np.array(rows, np.int32).reshape(-1, 3),
+            "score": np.array([one.score for one in found], np.float64),
+        }
+
+    if not others:
+        return []
+    name = name_of(least, [_values(standing[number]) for number in (k, *others)])
+    kept = remembered(memo, RELATED, name, compute)
+    numbers, kinds = (k, *others), list(Relation)
+    return [
+        Related(numbers[a], kinds[kind], numbers[b], score)
+        for (a, kind, b), score in zip(kept["rows"].tolist(), kept["score"].tolist(), strict=True)
+    ]
+
+
+def _values(one: _Standing) -> tuple[object, ...]:
+    return one.ground, one.low, one.high, one.area, one.sigma, one.category
 
 
 def _standing(thing: Landmark, names: Sequence[str], axes: FloatArray) -> _Standing:
@@ -172,7 +210,7 @@ def _level(one: _Standing, other: _Standing) -> float:
 
 def _half(value: float, middle: float, width: float) -> float:
     """1 far below `middle`, one half there, 0 far above: a logistic curve."""
-    return float(1 / (1 + np.exp(np.clip((value - middle) / max(width / 2, 1e-6), -60, 60))))
+    return float(1 / (1 + np.exp(min(max((value - middle) / max(width / 2, 1e-6), -60.0), 60.0))))
 
 
 def polygon_distance(one: FloatArray, other: FloatArray) -> float:

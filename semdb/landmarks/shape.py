@@ -4,7 +4,7 @@
 # mypy: disable-error-code="no-untyped-call"
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -13,20 +13,45 @@ from semdb.geometry import invert_pose, transform_points
 from semdb.geometry.sensor import depth_noise
 from semdb.landmarks.boxes import Box, upright_box
 from semdb.landmarks.lift import EXACT, LiftedKeyframe
+from semdb.landmarks.memo import Arrays, Memo, name_of, remembered
 from semdb.landmarks.options import ShapeOptions
 from semdb.types import FloatArray
 
+POINTS, NOISE, BOX = "points", "noise", "box"  # kinds of what is remembered
 MOST_VIEWS = 48  # that vote on the points of a thing
 
 
 def thing_points(
-    lifted: Sequence[LiftedKeyframe], members: Mapping[int, Sequence[int]], shape: ShapeOptions
+    lifted: Sequence[LiftedKeyframe],
+    members: Mapping[int, Sequence[int]],
+    shape: ShapeOptions,
+    memo: Memo | None = None,
 ) -> FloatArray:
     """Points ``[n, 3]`` (map) of a thing whose sightings are `members`: numbers of sightings by keyframe, ascending.
 
     A point stays when enough of the keyframes that have a sighting of the thing, and see the point, see it in there:
     what a mask took of the wall behind is gone. Where next to nothing stays, all points do.
     """
+    found = _remembered(memo, POINTS, lifted, members, shape, lambda: _points(lifted, members, shape))
+    return np.asarray(found, np.float64)
+
+
+def _remembered(
+    memo: Memo | None,
+    kind: str,
+    lifted: Sequence[LiftedKeyframe],
+    members: Mapping[int, Sequence[int]],
+    shape: ShapeOptions,
+    compute: Callable[[], FloatArray],
+) -> FloatArray:
+    """What is made of the sightings of a thing alone."""
+    if memo is None or not all(lifted[k].key for k in members):
+        return compute()
+    name = name_of(shape, [(lifted[k].key, sorted(numbers)) for k, numbers in sorted(members.items())])
+    return np.asarray(remembered(memo, kind, name, lambda: {kind: compute()})[kind], np.float64)
+
+
+def _points(lifted: Sequence[LiftedKeyframe], members: Mapping[int, Sequence[int]], shape: ShapeOptions) -> FloatArray:
     found = [
         transform_points(lifted[k].world_from_camera, lifted[k].outline[s])
         for k, numbers in sorted(members.items())
@@ -52,10 +77,21 @@ def thing_box(
     points: FloatArray,
     up: FloatArray,
     shape: ShapeOptions,
+    memo: Memo | None = None,
 ) -> Box:
     """The upright box about the `points` ``[n, 3]`` of a thing, without what the noise of depth adds to it."""
     trim = shape.trim if _noise(lifted, members) < EXACT else shape.noisy_trim
-    return upright_box(points, up, trim, noise=thing_noise(lifted, members, shape))
+    noise = _remembered(memo, NOISE, lifted, members, shape, lambda: thing_noise(lifted, members, shape))
+    if memo is None:
+        return upright_box(points, up, trim, noise=noise)
+    found = remembered(
+        memo, BOX, name_of(points, up, trim, noise), lambda: _arrays(upright_box(points, up, trim, noise=noise))
+    )
+    return Box(found["centre"], found["size"], found["axes"])
+
+
+def _arrays(box: Box) -> Arrays:
+    return {"centre": box.centre, "size": box.size, "axes": box.axes}
 
 
 def _noise(lifted: Sequence[LiftedKeyframe], members: Mapping[int, Sequence[int]]) -> float:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from semdb.landmarks.boxes import Box
+from semdb.landmarks.expected import ExpectedView
 from semdb.landmarks.gravity import Gravity
 from semdb.landmarks.visits import Visit
 from semdb.types import Float32Array, FloatArray
@@ -60,6 +61,7 @@ class Landmark:
     views: tuple[BestView, ...]  # the best first
     colours: Float32Array | None = None  # the mean of its sightings', see `appearance`
     visits: tuple[Visit, ...] = ()  # by number of the recording
+    expected: tuple[ExpectedView, ...] = ()  # by keyframe: those that see it and have no object there
 
     @property
     def key(self) -> tuple[int, int]:

@@ -11,6 +11,8 @@ import numpy as np
 
 from semdb.geometry import invert_pose, transform_points
 from semdb.landmarks.lift import LiftedKeyframe
+from semdb.landmarks.looked import Looked
+from semdb.landmarks.memo import Memo
 from semdb.landmarks.options import SeeOptions
 from semdb.threads import cores, each
 from semdb.types import Float32Array, FloatArray, Int64Array, IntArray
@@ -80,13 +82,23 @@ def look(
     sightings: Sightings,
     see: SeeOptions,
     progress: Callable[[int, int], None] | None = None,
+    memo: Memo | None = None,
 ) -> Views:
     """Looks every sighting up in every keyframe that may have it in view."""
-    chosen = np.arange(len(sightings), dtype=np.int64)
+    known = None
+    if memo is not None and all(frame.name for frame in lifted):
+        known = Looked(lifted, sightings.keyframe, (sightings.centre, sightings.radius), see, memo)
+    everything = np.arange(len(sightings), dtype=np.int64)
+
+    def one(number: int) -> tuple[np.ndarray, ...]:
+        if known is None:
+            return _look_in(number, lifted[number], sightings, everything, see)
+        return known.look_in(number, lambda chosen: _look_in(number, lifted[number], sightings, chosen, see))
+
     parts: list[tuple[np.ndarray, ...]] = []
     for start in range(0, len(lifted), _AT_ONCE):
         numbers = range(start, min(start + _AT_ONCE, len(lifted)))
-        parts += each(lambda number: _look_in(number, lifted[number], sightings, chosen, see), numbers, cores())
+        parts += each(one, numbers, cores())
         if progress is not None:
             progress(len(parts), len(lifted))
     return _joined(parts)

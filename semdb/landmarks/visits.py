@@ -20,12 +20,14 @@ from semdb.geometry import invert_pose
 from semdb.geometry.sensor import AT_LEAST_M, GROWTH_PER_M, NEAREST_M
 from semdb.landmarks.boxes import Box
 from semdb.landmarks.lift import LiftedKeyframe
+from semdb.landmarks.memo import Arrays, Memo, name_of, remembered
 from semdb.landmarks.options import ShapeOptions, VisitOptions
 from semdb.landmarks.shape import thing_box, thing_points
 from semdb.types import FloatArray, Int64Array, IntArray
 
 Members = Mapping[int, Sequence[int]]  # numbers of sightings by keyframe
 SEEN, THROUGH, OCCLUDED = range(3)
+VISIT = "visit"  # kind of what is remembered
 PLANE = 0.001  # 1/m, by which inverse depth may be off a plane at least
 
 
@@ -64,6 +66,7 @@ def visits_of(
     whole: tuple[FloatArray, Box],
     up: FloatArray,
     options: tuple[ShapeOptions, VisitOptions],
+    memo: Memo | None = None,
 ) -> tuple[Visit, ...]:
     """The visits of a landmark by number of recording, without those that never had it in view.
 
@@ -79,21 +82,41 @@ def visits_of(
         (only,) = there
         return (Visit(only, Presence.PRESENT, len(members), 0, 0, 0, 0, 0, whole[1]),)
     alone = len(by_visit) == 1
-    own = {number: whole[0] if alone else thing_points(lifted, part, shape) for number, part in by_visit.items()}
+    own: dict[int, FloatArray] = {}
+
+    def of_visit(number: int) -> FloatArray:
+        if number not in own:
+            own[number] = whole[0] if alone else thing_points(lifted, by_visit[number], shape, memo)
+        return own[number]
+
+    def compute() -> Arrays:
+        rows = []
+        for number in sorted(there):
+            others = [of_visit(other) for other in sorted(by_visit) if other != number]
+            known = np.concatenate(others) if others else np.empty((0, 3))
+            count = min(len(known), visit.points)
+            known = known[np.arange(count) * len(known) // max(count, 1)]
+            frames = [k for k in candidates.tolist() if recordings[k] == number]
+            counts, missed = _looked(lifted, frames, members, known, visit)
+            rows.append((*counts.tolist(), missed, count))
+        return {"counts": np.array(rows, np.int32)}
+
+    if memo is None or not all(lifted[k].key for k in (*members, *candidates.tolist())):
+        looked = compute()
+    else:
+        rank = {number: row for row, number in enumerate(sorted(there))}
+        of_members = [(rank[recordings[k]], lifted[k].key, sorted(numbers)) for k, numbers in sorted(members.items())]
+        of_candidates = " ".join(f"{rank[recordings[k]]} {lifted[k].key}" for k in candidates.tolist())
+        looked = remembered(memo, VISIT, name_of(shape, visit, of_members, of_candidates), compute)
     found = []
-    for number in sorted(there):
-        others = [points for other, points in sorted(own.items()) if other != number]
-        known = np.concatenate(others) if others else np.empty((0, 3))
-        known = known[np.arange(min(len(known), visit.points)) * len(known) // max(min(len(known), visit.points), 1)]
-        frames = [k for k in candidates.tolist() if recordings[k] == number]
-        counts, missed = _looked(lifted, frames, members, known, visit)
+    for number, (seen, through, occluded, missed, points) in zip(sorted(there), looked["counts"].tolist(), strict=True):
         mine = by_visit.get(number, {})
-        presence = Presence.PRESENT if mine else _without(counts, len(known), visit)
-        if not mine and not int(counts.sum()):
+        counts = np.array([seen, through, occluded], np.int32)
+        presence = Presence.PRESENT if mine else _without(counts, points, visit)
+        if not mine and not seen + through + occluded:
             continue
-        shown = None if not mine else whole[1] if alone else thing_box(lifted, mine, own[number], up, shape)
-        seen, through, occluded = (int(value) for value in counts)
-        found.append(Visit(number, presence, len(mine), len(known), seen, through, occluded, missed, shown))
+        shown = None if not mine else whole[1] if alone else thing_box(lifted, mine, of_visit(number), up, shape, memo)
+        found.append(Visit(number, presence, len(mine), points, seen, through, occluded, missed, shown))
     return tuple(found)
 
 

@@ -24,19 +24,25 @@ class SqlSource:
         self._changes = ChangeReader(store, map_id)
         self._encoder = SameEncoder(store, map_id)
         self._count: int | None = None
+        self._completed = False
         self._frequencies: dict[str, int] = {}
 
     def refresh(self) -> MapChange:
-        """Nothing is kept here but numbers of keyframes, of all and by class; what others keep may be out of date."""
+        """Nothing is kept here but numbers of keyframes, of all and by class, and whether landmarks complete these.
+
+        What others keep may be out of date.
+        """
         if self._count is None:
             self._changes.skip()
             self._encoder.check(changed=True)
             self._count = self._store.keyframe_count(self._map_id)
+            self._completed = self._store.completion_of(self._map_id) is not None
             return MapChange()
         change = summary_of(self._changes.read())
         self._encoder.check(bool(change))
         if change:
             self._count = self._store.keyframe_count(self._map_id)
+            self._completed = self._store.completion_of(self._map_id) is not None
             self._frequencies = {}
         return change
 
@@ -54,7 +60,7 @@ class SqlSource:
         return {name: known[name] for name in categories}
 
     def filtered(self, query: ClassQuery, minimum_share: float, at_most: int | None) -> Scored:
-        found = self._store.class_filter(self._map_id, query, minimum_share, at_most)
+        found = self._store.class_filter(self._map_id, query, minimum_share, at_most, self._completed)
         ids = np.array([keyframe.keyframe_id for keyframe in found], np.int64)
         return Scored(ids, np.array([keyframe.class_score for keyframe in found], np.float64))
 

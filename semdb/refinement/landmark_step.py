@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +11,9 @@ from sqlalchemy import Connection
 
 from semdb.database import landmark_rows
 from semdb.database.codecs import decode_mask
+from semdb.database.landmark_parts import LandmarkParts, LostPartError
 from semdb.database.landmark_records import (
+    CompletedClass,
     GravityRow,
     KeyframeDepth,
     LandmarkRelation,
@@ -24,20 +26,21 @@ from semdb.database.landmark_records import (
 from semdb.database.left_out import telling
 from semdb.database.pose_records import World
 from semdb.database.pose_sources import recording_poses
+from semdb.database.records import KeyframeHead
 from semdb.database.store import Store
 from semdb.errors import CodecError, FrameError
 from semdb.landmarks.options import LandmarkOptions
 from semdb.refinement.class_step import placed_objects
 from semdb.refinement.confusion import MILLION, ConfusionOptions, co_detections, confusions
-from semdb.types import Float32Array, FloatArray
+from semdb.types import Float32Array, FloatArray, Int64Array
 
 if TYPE_CHECKING:
-    from semdb.landmarks.lift import LiftedKeyframe
+    from semdb.landmarks.lift import Grids, LiftedKeyframe
     from semdb.landmarks.visits import Visit
 
 CLOCK_NS = 10**17  # times from here on (1973) are of the clock on the wall; smaller ones begin with their recording
 LEAST_EVIDENCE = 0.0005
-REVISION = 4  # of the computation: another one makes what is stored out of date
+REVISION = 5  # of the computation: another one makes what is stored out of date
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +58,18 @@ class LandmarkStep:
         return {"revision": REVISION, **asdict(self.options)}
 
     def compute(self, store: Store, map_id: int, progress: Callable[[int, int], None]) -> LandmarkSet:
+        try:
+            return self._compute(store, map_id, progress, LandmarkParts(store.engine, map_id, REVISION))
+        except LostPartError:
+            return self._compute(store, map_id, progress, LandmarkParts(store.engine, map_id, REVISION, empty=True))
+
+    def _compute(
+        self, store: Store, map_id: int, progress: Callable[[int, int], None], parts: LandmarkParts
+    ) -> LandmarkSet:
         from semdb.landmarks.build import SeenKeyframe, find_landmarks
         from semdb.landmarks.lift import SeenObject, lift_keyframe
+        from semdb.landmarks.memo import name_of
+        from semdb.landmarks.remembered_lift import LIFT, lift_arrays, lifted_from
         from semdb.threads import cores, each
 
         gravity = landmark_rows.load_gravity(store.engine, map_id)
@@ -69,7 +82,22 @@ class LandmarkStep:
         rows: list[KeyframeDepth] = []
         seen: list[SeenKeyframe] = []
 
+        def name(head: KeyframeHead | KeyframeDepth) -> str:
+            made = (self.options.lift, self.options.see)
+            return name_of(*made, head.id, head.recording, head.frame_index, head.timestamp_ns, head.camera)
+
         def lift(row: KeyframeDepth) -> SeenKeyframe | CodecError:
+            known = parts.get(LIFT, name(row)) if row.rgb == landmark_rows.NOT_READ else None
+            if known is None:
+                return lift_anew(row)
+            grids = _LazyGrids(parts, name(row))
+            lifted, colours = lifted_from(row.camera, row.world_from_camera, name(row), known, grids)
+            if len(lifted.sighting_of) != len(row.objects):
+                raise LostPartError
+            category = np.array([numbers[thing.category] for thing in row.objects], np.int64)
+            return seen_as(row, lifted, category, [thing.score for thing in row.objects], colours)
+
+        def lift_anew(row: KeyframeDepth) -> SeenKeyframe | CodecError:
             size = (row.camera.height, row.camera.width)
             try:
                 things = [
@@ -84,14 +112,28 @@ class LandmarkStep:
             lifted = lift_keyframe(
                 row.camera, row.world_from_camera, depth, things, self.options.lift, self.options.see
             )
+            lifted, colours = replace(lifted, name=name(row)), colours_in(row, lifted, telling(store.say))
+            for kind, arrays in lift_arrays(lifted, colours).items():
+                parts.put(kind, lifted.name, arrays)
             category = np.array([thing.category for thing in things], np.int64)
-            score = np.array([thing.score for thing in things], np.float64)
+            return seen_as(row, lifted, category, [thing.score for thing in things], colours)
+
+        def seen_as(
+            row: KeyframeDepth,
+            lifted: LiftedKeyframe,
+            category: Int64Array,
+            scores: Sequence[float],
+            colours: Float32Array | None,
+        ) -> SeenKeyframe:
             time = row.timestamp_ns if row.timestamp_ns is not None and row.timestamp_ns >= CLOCK_NS else None
             number = recordings.setdefault(row.recording, len(recordings))
-            return SeenKeyframe(lifted, category, score, number, time, colours_in(row, lifted, telling(store.say)))
+            return SeenKeyframe(lifted, category, np.array(scores, np.float64), number, time, colours)
+
+        def is_known(head: KeyframeHead) -> bool:
+            return parts.get(LIFT, name(head)) is not None
 
         recordings: dict[str, int] = {}
-        for chunk in landmark_rows.iter_keyframe_depths(store.engine, map_id, store.left_out):
+        for chunk in landmark_rows.iter_keyframe_depths(store.engine, map_id, store.left_out, is_known):
             for row in chunk:
                 recordings.setdefault(row.recording, len(recordings))
                 for thing in row.objects:  # of a keyframe whose objects have no place, perhaps
@@ -111,13 +153,37 @@ class LandmarkStep:
         classes = sorted(numbers, key=lambda name: numbers[name])
         wide = np.zeros((len(classes), len(classes)))
         wide[: len(names), : len(names)] = confusion
-        found_all = find_landmarks(seen, len(classes), wide, up, self.options, show)
-        return _stored(found_all, rows, classes, list(recordings), told=told)
+        found_all = find_landmarks(seen, len(classes), wide, up, self.options, show, parts)
+        stored = _stored(found_all, rows, classes, list(recordings), parts, told=told)
+        parts.save()
+        return stored
 
     def write(self, connection: Connection, map_id: int, result: LandmarkSet) -> int:
         from semdb.landmarks.identity import keep_ids
 
         return landmark_rows.replace_landmarks(connection, map_id, result, keep_ids)
+
+
+class _LazyGrids:
+    """What is large of a keyframe, read when it is first asked for."""
+
+    def __init__(self, parts: LandmarkParts, name: str) -> None:
+        from semdb.landmarks.remembered_lift import GRID
+
+        self._parts, self._name = parts, name
+        parts.keep(GRID, name)
+        self._found: Grids | None = None
+
+    def __call__(self) -> Grids:
+        """Raises LostPartError where it is not there, or damaged."""
+        from semdb.landmarks.remembered_lift import GRID, grids_from
+
+        if self._found is None:
+            large = self._parts.get(GRID, self._name)
+            if large is None:
+                raise LostPartError
+            self._found = grids_from(large)
+        return self._found
 
 
 def _confusion(placed: Any, names: Sequence[str]) -> FloatArray:
@@ -175,9 +241,16 @@ def _up_of_poses(store: Store, map_id: int) -> FloatArray | None:
 
 
 def _stored(
-    found: Any, rows: Sequence[KeyframeDepth], classes: Sequence[str], recordings: Sequence[str], *, told: bool
+    found: Any,
+    rows: Sequence[KeyframeDepth],
+    classes: Sequence[str],
+    recordings: Sequence[str],
+    parts: LandmarkParts,
+    *,
+    told: bool,
 ) -> LandmarkSet:
     from semdb.landmarks.boxes import upright_axes
+    from semdb.landmarks.completion import completed
     from semdb.landmarks.evidence import perhaps
     from semdb.landmarks.relations import find_relations
 
@@ -224,7 +297,7 @@ def _stored(
                 perhaps={classes[k]: share for k, share in others.items()},
             )
         )
-    related = find_relations(found.landmarks, classes, found.gravity.up)
+    related = find_relations(found.landmarks, classes, found.gravity.up, memo=parts)
     up_x, up_y, up_z = (float(value) for value in found.gravity.up)
     gravity = GravityRow(
         (up_x, up_y, up_z),
@@ -234,4 +307,10 @@ def _stored(
         told,
     )
     relations = tuple(LandmarkRelation(r.one, str(r.kind), r.other, r.score) for r in related)
-    return LandmarkSet(tuple(stored), relations, gravity)
+    objects = [[(thing.category, thing.score, thing.height) for thing in row.objects] for row in rows]
+    more = tuple(
+        CompletedClass(row.id, name, *pair)
+        for row, found_more in zip(rows, completed(objects, found.landmarks, classes), strict=True)
+        for name, pair in sorted(found_more.items())
+    )
+    return LandmarkSet(tuple(stored), relations, gravity, more)

@@ -12,11 +12,12 @@ from dataclasses import dataclass
 
 from sqlalchemy.exc import IntegrityError
 
+from semdb.database.landmark_parts import forget_parts
 from semdb.database.records import MapInfo
 from semdb.database.store import Store
 from semdb.errors import DatabaseError, NotFoundError, UsageError
 from semdb.refinement.step import Step
-from semdb.refinement.steps import STEPS
+from semdb.refinement.steps import LANDMARKS, STEPS
 
 ATTEMPTS = 3  # of a step while the map changes under it
 Progress = Callable[[str, int, int], None]  # what, done, total
@@ -42,7 +43,7 @@ def refine_map(
     force: bool = False,
     progress: Progress | None = None,
 ) -> list[StepResult]:
-    """Runs the steps that are out of date (with `force` all), of the named `kinds` or of all.
+    """Runs the steps that are out of date (with `force` all, and from nothing), of the named `kinds` or of all.
 
     Raises UsageError for a kind that is none, NotFoundError when the map is deleted meanwhile, DatabaseError when it
     never holds still.
@@ -53,6 +54,8 @@ def refine_map(
         if known is not None and known.current and known.parameters == dict(step.parameters) and not force:
             results.append(StepResult(info.name, step.kind, step.summary, known.rows, computed=False, current=True))
             continue
+        if force and step.kind == LANDMARKS:
+            forget_parts(store.engine, info.id)
         rows, current = _run(store, info, step, progress)
         results.append(StepResult(info.name, step.kind, step.summary, rows, computed=True, current=current))
     return results

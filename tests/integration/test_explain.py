@@ -136,6 +136,7 @@ def _values(store: Store, map_ids: list[int]) -> dict[str, Any]:
         "at_most": 20,
         "categories": list(COUNTS),
         "minimum_share": 0.5,
+        "completed": True,
         "change_id": 500,
         "vector": np.ones(128, np.float32),
         "encoder": store.encoder_id(map_ids[0]),

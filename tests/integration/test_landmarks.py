@@ -29,16 +29,17 @@ FRAMES = 6
 PICTURE = cv2.imencode(".png", np.zeros((2, 2, 3), np.uint8))[1].tobytes()  # nobody looks at it
 
 
-@lru_cache(maxsize=1)
-def records() -> tuple[KeyframeRecord, ...]:
-    """Keyframes of a rendered room."""
+@lru_cache(maxsize=2)
+def records(spoiled: bool = False) -> tuple[KeyframeRecord, ...]:
+    """Keyframes of a rendered room; `spoiled`: the third one misses what all show most of."""
     sequence = SyntheticSequence(SyntheticOptions(frames=FRAMES, lap_frames=24, width=320, height=240, room_seed=7))
     describer = Describer(RecordedDetector(), GistEncoder(), load_features("orb", Settings()))
-    found = []
-    for index in range(FRAMES):
-        frame = sequence.render(index)
+    found, frames = [], [sequence.render(index) for index in range(FRAMES)]
+    largest = max(sequence.classes, key=lambda label: min(np.count_nonzero(frame.labels == label) for frame in frames))
+    for index, frame in enumerate(frames):
         depth = np.where(frame.depth > 0, frame.depth, np.nan).astype(np.float32)
-        masks = InstanceMasks(frame.labels, sequence.classes)
+        labels = np.where(frame.labels == largest, 0, frame.labels) if spoiled and index == 2 else frame.labels
+        masks = InstanceMasks(labels, sequence.classes)
         made = describer.describe(frame.rgb, depth, sequence.camera, masks)
         packed = encode_16bit(np.rint(frame.depth * 5000).astype(np.uint16))
         pose = frame.world_from_camera
@@ -47,9 +48,9 @@ def records() -> tuple[KeyframeRecord, ...]:
     return tuple(found)
 
 
-def ingest(store: Store, order: Sequence[int], name: str = "room") -> MapInfo:
+def ingest(store: Store, order: Sequence[int], name: str = "room", *, spoiled: bool = False) -> MapInfo:
     map_id = store.ensure_map(name)
-    made = records()
+    made = records(spoiled)
     planned = tuple(range(FRAMES))
     plan = RecordingPlan("visit", "synthetic", "rendered", FRAMES, "rendered", planned)
     recording = store.plan_recording(map_id, plan, made[0].description.models).recording_id
@@ -103,6 +104,15 @@ def contents(store: Store) -> list[object]:
         "JOIN objects o ON o.id = v.object_id JOIN keyframes k ON k.id = o.keyframe_id",
     )
     found += [(named[int(str(key))], *rest) for key, *rest in views]
+    found += table(
+        store,
+        "SELECT k.frame_index, c.name, b.count, b.upper_strength, b.lower_strength, b.keyframe_strength "
+        "FROM completed_categories b JOIN keyframes k ON k.id = b.keyframe_id "
+        "JOIN categories c ON c.id = b.category_id",
+    )
+    visits = "presence, keyframes, points, seen, seen_through, occluded, missed, x, y, z, size_x, size_y, size_z"
+    of_visits = table(store, f"SELECT landmark_id, {visits} FROM landmark_visits")
+    found += [(named[int(str(key))], *rest) for key, *rest in of_visits]
     found += table(store, "SELECT up_x, up_y, up_z, up_certainty, floor, floor_certainty, given FROM map_gravity")
     return sorted(found, key=repr)
 

@@ -17,9 +17,12 @@ from sqlalchemy import Engine, inspect, text
 import semdb.migrations
 from semdb.api.finding import find
 from semdb.database import schema, tokens
+from semdb.database.completions import replace_completions
 from semdb.database.engine import make_engine
 from semdb.database.frame_views import FrameHead, FrameRow, load_frame_heads, load_frames, write_frame_views
-from semdb.database.landmark_rows import load_gravity
+from semdb.database.landmark_parts import LandmarkParts
+from semdb.database.landmark_records import CompletedClass
+from semdb.database.landmark_rows import LANDMARKS, load_gravity
 from semdb.database.links import list_links
 from semdb.database.pose_errors import load_pose_errors, replace_pose_errors
 from semdb.database.pose_records import PoseSource, World
@@ -287,6 +290,48 @@ def test_keyframes_of_before_have_no_frames_beside_them(engine: Engine, empty_ur
         np.testing.assert_array_equal(found.keypoints.features.descriptors, keypoints.features.descriptors)
         store.delete_recording(recording_id)
         assert load_frame_heads(engine, map_id) == []
+
+
+def test_keyframes_of_before_are_as_they_were_seen(engine: Engine, empty_url: str) -> None:
+    schema.upgrade(engine)
+    counts = {"chair": 2.0, "cup": 1.0}
+    with open_store(empty_url) as store:
+        map_id, _, ids = fill(store)
+        stored_landmarks(store, map_id)
+        query = store.class_query(map_id, counts)
+        before = store.class_filter(map_id, query, 0.0)
+        assert len(before) > 1
+        computed = store.replace_refinement(map_id, LANDMARKS, store.map_state(map_id), {}, lambda *_: 7, ())
+        assert computed == 7
+    schema.downgrade(engine, "0016")
+    assert not {"completed_categories", "map_completions"} & set(inspect(engine).get_table_names())
+    schema.upgrade(engine)
+    with open_store(empty_url) as store:
+        assert store.completion_of(map_id) is None  # though the step is up to date: it knew nothing of this
+        assert store.class_filter(map_id, query, 0.0) == before
+        with engine.connect() as connection:
+            known = {str(name): int(key) for key, name in connection.execute(text("SELECT id, name FROM categories"))}
+            name = connection.execute(text("SELECT MIN(c.name) FROM keyframe_categories k JOIN categories c ON "
+                                           "c.id = k.category_id")).scalar()  # fmt: skip
+        found = [CompletedClass(ids[0], str(name), 200, 100)]
+        with engine.begin() as connection:
+            replace_completions(connection, map_id, found, known)
+        assert store.completion_of(map_id) == store.map_state(map_id)
+    schema.downgrade(engine, "0017")
+    assert "landmark_parts" not in inspect(engine).get_table_names()
+    schema.upgrade(engine)
+    with open_store(empty_url) as store:
+        assert store.completion_of(map_id) == store.map_state(map_id)
+        parts = LandmarkParts(engine, map_id, 4)
+        parts.put("box", "a name", {"centre": np.arange(3.0)})
+        parts.save()
+        kept = LandmarkParts(engine, map_id, 4).get("box", "a name")
+        assert kept is not None
+        assert kept["centre"].tolist() == [0, 1, 2]
+        store.delete_map(map_id)
+    with engine.connect() as connection:
+        for table in ("completed_categories", "map_completions", "landmark_parts"):
+            assert connection.execute(text(f"SELECT COUNT(*) FROM {table}")).scalar() == 0
 
 
 def test_a_database_of_before_gets_tokens(engine: Engine, empty_url: str) -> None:

@@ -10,7 +10,7 @@ import pytest
 from semdb.geometry import invert_pose, pose_error, pose_from, so3_exp
 from semdb.landmarks.build import SeenKeyframe, find_landmarks
 from semdb.landmarks.gravity import estimate_gravity
-from semdb.landmarks.lift import LiftedKeyframe, SeenObject, lift_keyframe
+from semdb.landmarks.lift import Grids, LiftedKeyframe, SeenObject, lift_keyframe
 from semdb.landmarks.register import corrected_poses
 from semdb.landmarks.values import Landmarks, LandmarkState
 from semdb.recordings.synthetic import SyntheticOptions, SyntheticSequence
@@ -154,11 +154,10 @@ def without_objects(lifted: LiftedKeyframe) -> LiftedKeyframe:
         lifted,
         sighting_of=np.empty(0, np.int64),
         points=(),
-        outline=(),
         areas=np.empty(0, np.int64),
         beside=np.empty((0, 0), bool),
         cut=np.empty(0, bool),
-        grid_owner=np.zeros_like(lifted.grid_owner),
+        grids=lambda: Grids((), lifted.grid_depth, np.zeros_like(lifted.grid_owner)),
     )
 
 

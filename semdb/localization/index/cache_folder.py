@@ -108,6 +108,7 @@ class CacheFolder:
             raise CacheError("its arrays do not belong together")
         self._files = {file.name: file for file in files}
         mirror = Mirror(options)
+        mirror.completion = header.get("completion")  # files of before have none
         mirror.set_rows(ids, alive, header["categories"], counts, parts)
         if "codes" in arrays and rows > options.exact_up_to and len(arrays["axes"]) == options.components:
             reduction = Reduction(arrays["mean"], arrays["axes"], arrays["scales"], header["fitted_on"])
@@ -169,6 +170,7 @@ class CacheFolder:
             "categories": list(mirror.categories),
             "size": mirror.parts[0].array.shape[1] if mirror.parts else 0,
             "files": [[file.name, file.rows, file.checksums] for file in files],
+            "completion": mirror.completion,
             "fitted_on": mirror.reduction.fitted_on if mirror.reduction is not None else 0,
         }
         write_arrays(self._index, header, mirror.arrays())

@@ -16,7 +16,7 @@ from semdb.localization.changes import ChangeReader, summary_of
 from semdb.localization.coarse import MapChange
 from semdb.localization.index.cache_files import CacheError
 from semdb.localization.index.cache_folder import CacheFolder
-from semdb.localization.index.loading import load_mirror, same_as_database
+from semdb.localization.index.loading import complete, load_mirror, same_as_database
 from semdb.localization.index.mirror import IndexOptions, Mirror, reduced
 from semdb.localization.index.state import State
 from semdb.types import Int64Array
@@ -157,6 +157,8 @@ class MapIndex:
                 return
             self._mirror.append(rows.ids, rows.vectors, rows.words)
         self._unsaved += len(gone) + len(wanted)
+        if complete(self.store, self.map_id, self._mirror, changed=bool(change)):
+            self._unsaved += len(self._mirror)
 
     def _rows(self, wanted: Int64Array, size: int) -> CoarseRows:
         """What is there of keyframes; vectors have `size` numbers where none says otherwise by being whole."""

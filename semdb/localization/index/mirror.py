@@ -19,6 +19,7 @@ from semdb.types import BoolArray, Float32Array, Int64Array, IntArray
 Number = TypeVar("Number", bound=np.generic)
 SPARE_CLASSES = 16
 SPARE_ROWS = 1024
+MOST_ROWS = 2**31
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +49,7 @@ class Mirror:
         self._frequencies: Int64Array = np.zeros(SPARE_CLASSES, np.int64)
         self._codes: CodeArray | None = None
         self.renumbered = 0  # how often rows got other numbers
+        self.completion: str | None = None  # state of the map of which landmarks complete its words; None: as seen
 
     def __len__(self) -> int:
         return self._count
@@ -98,6 +100,21 @@ class Mirror:
         for row in self._strengths():
             self._held += self._counts[row]
         self.parts, self.tail = list(parts), None
+
+    def set_words(self, state: State, columns: Mapping[str, tuple[Int64Array, Int64Array]]) -> None:
+        """Puts other numbers in place of all; `state` is the latest, `columns` keyframes and numbers of each word."""
+        names = sorted({*self.categories, *columns}, key=lambda name: (self.categories.get(name, MOST_ROWS), name))
+        counts = np.zeros((len(names) + SPARE_CLASSES, self._counts.shape[1]), np.uint8)
+        for row, name in enumerate(names):
+            keys, numbers = columns.get(name, (np.empty(0, np.int64), np.empty(0, np.int64)))
+            places, there = state.find(keys)
+            counts[row, places[there]] = np.minimum(numbers[there], MOST_OBJECTS)
+        self.categories = {name: row for row, name in enumerate(names)}
+        self._counts, held = counts, np.zeros(len(self._held), np.int32)
+        self._frequencies = np.count_nonzero(counts, axis=1).astype(np.int64)
+        for row in self._strengths():
+            held[: counts.shape[1]] += counts[row]
+        self._held = held
 
     def _strengths(self) -> list[int]:
         """The rows of `counts` that are strengths, not numbers of objects."""
