@@ -323,6 +323,13 @@ class KeyframeCache:
                 found.append(self._small_views.placed(keyframe_id, world_from_camera))
         return best_seen([view for view in found if view is not None], pose, query, count), None in found
 
+    def small_views(self, keyframes: Sequence[KeyframeView]) -> list[PlacedView]:
+        """What those of `keyframes` show that have depth."""
+        with self._turn:
+            own = [one for one in keyframes if one.keyframe_id > 0]  # of frames beside keyframes no depth is kept
+            found = [self._small_views.placed(one.keyframe_id, one.world_from_camera) for one in own]
+            return [view for view in found if view is not None]
+
     def edges_of(self, views: Sequence[PlacedView]) -> list[PlacedEdges]:
         """The edges of the keyframes that `views` are of, in their order."""
         with self._turn:

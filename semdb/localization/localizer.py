@@ -33,7 +33,7 @@ from semdb.localization.search import Search, best_of, best_pairs, candidates_of
 from semdb.localization.sources import TimedSource
 from semdb.localization.telling_apart import tell_apart
 from semdb.localization.verdict import Judgement, convinces
-from semdb.localization.view_step import Viewing
+from semdb.localization.viewing import Viewing
 from semdb.localization.views import View, make_view
 from semdb.perception.quality import complaint_of, image_quality
 from semdb.types import Description, FloatArray, Localization, ModelInfo, Tolerance, Verdict

@@ -21,8 +21,11 @@ ACROSS = 213  # pixels
 BLUR = 0.7  # of both: the noise of a sensor is not what they show
 WINDOW = 11
 REACH = (-1, 0, 1)  # pixels that a window may lie beside, in each direction
-LEAST_CONTRAST = 10.0  # variance of a window, in grey values squared, of either image
+LEAST_CONTRAST = 10.0  # variance of a window, in grey values squared, of either image; less of one of little contrast
+WHOLE = (0.0, 255.0)
 ALIKE = 0.7
+MOST_GAIN = 8.0
+LEAST_GAINED = 100  # windows of one shape, by which it is told
 LEAST_WINDOWS = 150
 SAMPLED = 12  # pixels from one point of a keyframe, by which it is chosen, to the next
 LEAST_M = 0.1
@@ -37,6 +40,7 @@ class SmallView:
     grey: Float32Array  # [h, w]
     depth: Float32Array | None  # [h, w]
     samples: FloatArray  # [n, 3] some of its points, camera frame
+    span: tuple[float, float] = WHOLE  # grey values; what is darker or brighter is not told apart
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,13 +52,18 @@ class PlacedView:
     view: SmallView
 
 
-def small_view(camera: Camera, grey: ImageArray, depth: Float32Array | None = None) -> SmallView:
-    """Of an image ``[H, W]`` with `depth` ``[H, W]`` metres."""
+def small_view(
+    camera: Camera, grey: ImageArray, depth: Float32Array | None = None, stretch: tuple[float, float] | None = None
+) -> SmallView:
+    """Of an image ``[H, W]`` with `depth` ``[H, W]`` metres, as it was seen before its contrast was stretched so."""
+    low, high = span = stretch or WHOLE
     seen, small = without_distortion(camera, grey.astype(np.float32), cv2.INTER_LINEAR, ACROSS)
+    if stretch is not None:
+        small = np.asarray(low + small * ((high - low) / 255), np.float32)
     small = np.asarray(cv2.GaussianBlur(small, (0, 0), BLUR), np.float32)
     if depth is not None:
         _, depth = without_distortion(camera, depth, cv2.INTER_NEAREST, ACROSS)
-    return SmallView(np.array([seen.fx, seen.fy, seen.cx, seen.cy]), small, depth, _samples(seen, depth))
+    return SmallView(np.array([seen.fx, seen.fy, seen.cx, seen.cy]), small, depth, _samples(seen, depth), span)
 
 
 def _samples(camera: Camera, depth: Float32Array | None) -> FloatArray:
@@ -107,19 +116,21 @@ def compare_view(
 
     They are the best first. A window may lie aside by as many pixels as `reach` names, in each direction.
     """
-    from semdb.localization.view_kernels import sample, splat
+    from semdb.localization.view_kernels import fill, sample, splat
 
     height, width = query.grey.shape
-    nearest = np.full((height, width), np.inf, np.float32)
+    nearest, filled = np.full((2, height, width), np.inf, np.float32)
     with_depth = [(keyframe, keyframe.view.depth) for keyframe in keyframes if keyframe.view.depth is not None]
     for keyframe, depth in with_depth:  # the best first: one that is far off knows it less exactly
         own = np.full((height, width), np.inf, np.float32)
         splat(depth, keyframe.view.intrinsics, keyframe.world_from_camera, query.intrinsics, pose, own)
-        np.copyto(nearest, own, where=np.isinf(nearest))
+        fill(own, filled)
+        np.copyto(nearest, filled, where=np.isinf(nearest))
     best = np.full((height, width), -2.0, np.float32)
     compared = np.zeros((height, width), np.bool_)
     known = np.zeros((height, width), np.bool_)
     mean, variance = _moments(query.grey)
+    least = LEAST_CONTRAST * (query.span[1] - query.span[0]) / 255  # its noise has been made little, too
     seen = np.empty((height, width), np.float32)
     for keyframe, depth in with_depth:
         place = keyframe.view
@@ -131,8 +142,8 @@ def compare_view(
         whole = cv2.erode(there.astype(np.uint8), np.ones((WINDOW, WINDOW), np.uint8), borderValue=0) > 0
         if not whole.any():
             continue
-        filled = np.where(there, seen, np.float32(0))
-        like, contrast = _likeness(query.grey, mean, variance, filled, reach)
+        shown = np.clip(np.where(there, seen, np.float32(0)), *query.span)
+        like, contrast = _likeness(query.grey, mean, variance, shown, whole, least, reach)
         whole &= contrast
         np.maximum(best, like, out=best, where=whole)
         compared |= whole
@@ -140,22 +151,46 @@ def compare_view(
 
 
 def _likeness(
-    grey: Float32Array, mean: Float32Array, variance: Float32Array, predicted: Float32Array, reach: Sequence[int]
+    grey: Float32Array,
+    mean: Float32Array,
+    variance: Float32Array,
+    predicted: Float32Array,
+    whole: BoolArray,
+    least: float,
+    reach: Sequence[int],
 ) -> tuple[Float32Array, BoolArray]:
     """The greatest likeness of windows of two images ``[h, w]``, one moved a pixel at most, and where either shows any.
 
-    It is twice the covariance over the sum of variances: contrast that one has and the other has not counts too.
+    It is twice the covariance over the sum of variances: contrast that one has and the other has not counts too, once
+    they are of one exposure.
     """
     its_mean, its_variance = _moments(predicted)
+    gain = _gain(_box(grey * predicted) - mean * its_mean, variance, its_variance, whole, least)
+    its_variance = gain * gain * its_variance
     total = variance + its_variance
     best = np.full(grey.shape, -1.0, np.float32)
     for dy in reach:
         for dx in reach:
             moved = np.roll(grey, (dy, dx), axis=(0, 1))
-            product = _box(moved * predicted)
             m, v = np.roll(mean, (dy, dx), axis=(0, 1)), np.roll(variance, (dy, dx), axis=(0, 1))
-            np.maximum(best, 2 * (product - m * its_mean) / np.maximum(v + its_variance, 1e-2), out=best)
-    return best, total > 2 * LEAST_CONTRAST
+            both = gain * (_box(moved * predicted) - m * its_mean)
+            np.maximum(best, 2 * both / np.maximum(v + its_variance, 1e-2), out=best)
+    return best, total > 2 * least
+
+
+def _gain(
+    both: Float32Array, variance: Float32Array, its_variance: Float32Array, whole: BoolArray, least: float
+) -> np.float32:
+    """By how much an image is brighter than what is predicted: the median of `whole` windows of one shape in both.
+
+    `both` is their covariance. 1 where hardly any is, as at a wrong pose.
+    """
+    shape = whole & (variance + its_variance > 2 * least)
+    shape &= both > ALIKE * np.sqrt(np.maximum(variance * its_variance, 1e-4))
+    if np.count_nonzero(shape) < LEAST_GAINED:
+        return np.float32(1)
+    ratio = np.median(variance[shape] / np.maximum(its_variance[shape], 1e-4))
+    return np.float32(np.sqrt(np.clip(ratio, MOST_GAIN**-2, MOST_GAIN**2)))
 
 
 def _box(image: Float32Array) -> Float32Array:

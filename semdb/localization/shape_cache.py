@@ -17,7 +17,6 @@ from semdb.localization.likeness import small_inverse_depth
 from semdb.localization.predicted_view import PlacedView, SmallView, small_view
 from semdb.localization.surface_alignment import PlacedSurfaces, place
 from semdb.localization.surfaces import Surfaces, surfaces_of
-from semdb.perception.quality import with_contrast
 from semdb.recordings.images import decode_color_grey
 from semdb.recordings.registration import decode_registered_depth
 from semdb.types import Float32Array, FloatArray, ImageArray
@@ -127,7 +126,7 @@ def view_cache(store: Store) -> ShapeCache[SmallView, PlacedView]:
     """Of the small images from which it is predicted what a query shows."""
     return ShapeCache(
         store,
-        lambda stored, depth, grey: small_view(stored.camera, with_contrast(grey)[0], depth),
+        lambda stored, depth, grey: small_view(stored.camera, grey, depth),
         lambda keyframe_id, view, pose: PlacedView(keyframe_id, pose, view),
         VIEWS,
     )

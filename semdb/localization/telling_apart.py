@@ -9,12 +9,21 @@ from semdb.geometry import invert_pose
 from semdb.localization.coarse import Stage
 from semdb.localization.confidence import Evidence
 from semdb.localization.fine_step import FineStep
-from semdb.localization.laid_pose import support_of
+from semdb.localization.laid_pose import LaidPose, estimate_with, support_of
 from semdb.localization.pose import first_pose_at
 from semdb.localization.predicted_view import SmallView
 from semdb.localization.search import Search, evidence_of
 from semdb.localization.verdict import Judgement, judge
-from semdb.localization.view_step import Standing, Viewing, is_like, is_same, is_weak, judge_seen, view_numbers
+from semdb.localization.view_step import (
+    Standing,
+    is_like,
+    is_same,
+    is_weak,
+    judge_seen,
+    view_numbers,
+    vouches,
+)
+from semdb.localization.viewing import Viewing
 from semdb.types import ConsistentPose, Description, FloatArray, Verdict
 
 Judged = tuple[Judgement, Evidence | None]
@@ -36,7 +45,7 @@ def tell_apart(
     viewing = replace(viewing, options=viewing.options.accepting(search.accept))
     options, bounds = viewing.options, fine.options.verdict.accepting(search.accept)
     weak = evidence is not None and is_weak(evidence, options)
-    doubted = weak if judgement.verdict is Verdict.LOCALIZED else judgement.verdict is Verdict.AMBIGUOUS
+    doubted = weak if judgement.verdict is Verdict.LOCALIZED else True
     query = viewing.of(description) if doubted and search.keyframes else None
     standing = None if query is None else _standing(fine, viewing, search, query, description)
     if query is None or standing is None:
@@ -45,12 +54,13 @@ def tell_apart(
     pose, own = standing.best.world_from_camera, False
     if search.estimate is not None:
         own = is_same(search.estimate.world_from_camera, pose, options.same)
+    laid = None
     if standing.is_sure(options):
         search.seen = pose
-        anew = _found_at(fine, viewing, search, query, own)
+        anew, laid = _found_at(fine, viewing, search, query, description, own)
         if anew is not None:
             own, (judgement, evidence) = True, anew
-    after = judge_seen(judgement, evidence, standing, own, options, bounds)
+    after = judge_seen(judgement, evidence, standing, own, options, bounds, laid is not None)
     if after.verdict is not judgement.verdict and after.verdict is Verdict.AMBIGUOUS and search.estimate:
         _name_others(search, standing.against(search.estimate.world_from_camera, options))
     return after, evidence
@@ -71,30 +81,37 @@ def _standing(
     return standing
 
 
-def _found_at(fine: FineStep, viewing: Viewing, search: Search, query: SmallView, own: bool) -> Judged | None:
-    """What keypoints say about the pose that is sure (`search.seen`), which the search then has.
+def _found_at(
+    fine: FineStep, viewing: Viewing, search: Search, query: SmallView, description: Description, own: bool
+) -> tuple[Judged | None, LaidPose | None]:
+    """What keypoints say about the pose that is sure (`search.seen`), which the search then has, and edges laid there.
 
-    None, and the search as it was, where they find none there, or it does not look like the query. `own` is whether
+    None, and the search as it was, where neither finds any there, or it does not look like the query. `own` is whether
     it is the pose that they had found.
     """
-    pose, before = search.seen, (search.first, search.estimate)
+    pose, before, options = search.seen, (search.first, search.estimate), viewing.options
+    bounds, edges = fine.options.verdict.accepting(search.accept), fine.options.edges
     if pose is None:
-        return None
+        return None, None
     search.first = first_pose_at(search.query, search.keyframes, search.matches, invert_pose(pose), search.pose)
     search.estimate = None
     fine.ask_neighbours(search)
-    fine.estimate(search)
+    laid = None if edges is None else viewing.laid(search, query, description, pose, edges, bounds)
+    if laid is None or edges is None:
+        fine.estimate(search)
+    else:  # keypoints along edges, or too few of them, leave a pose free that edges hold
+        search.estimate = estimate_with(laid, search.query, search.keyframes, search.matches, edges, search.pose)
     found = search.estimate
     anew = None if found is None else evidence_of(search, found, 0)
-    said = judge(anew, fine.options.verdict.accepting(search.accept))  # of another pose something else was said
-    failed = found is None or said.verdict is Verdict.FAILED
-    if found is None or failed or not is_like(viewing.see(query, found.world_from_camera), viewing.options):
+    said = judge(anew, bounds)  # of another pose something else was said
+    failed = said.verdict is Verdict.FAILED and not (laid is not None and vouches(anew, options.least_support, bounds))
+    if found is None or failed or not is_like(viewing.see(query, found.world_from_camera), options):
         search.first, search.estimate = before
-        return None
+        return None, None
     search.alike = search.alike if own else None  # that was of another pose
     search.seen = found.world_from_camera
     search.others.clear()
-    return said, anew
+    return (said, anew), laid
 
 
 def _name_others(search: Search, poses: Sequence[FloatArray]) -> None:

@@ -7,21 +7,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from semdb.geometry import invert_pose, pose_error
+from semdb.geometry import pose_error
 from semdb.localization.confidence import Evidence
-from semdb.localization.edge_alignment import EdgeOptions, fit_edges
-from semdb.localization.edges import ImageEdges, image_edges
-from semdb.localization.keyframe_cache import KeyframeCache
-from semdb.localization.pairs import join_pairs, world_points_of
-from semdb.localization.pose import robust_pnp
-from semdb.localization.predicted_view import ALIKE, PlacedView, SmallView, Windows, compare_view, small_view
-from semdb.localization.search import Search
+from semdb.localization.edge_alignment import EdgeOptions
+from semdb.localization.predicted_view import ALIKE, Windows
 from semdb.localization.verdict import Judgement, VerdictOptions, is_precise
-from semdb.types import Description, FloatArray, Tolerance, Verdict
-
-LEAST_PAIRS = 8  # of a keyframe alone, for a pose of its own
-ITERATIONS = 400
-LEAST_SHARE = 0.25  # of the pairs of the best pose of a keyframe alone
+from semdb.localization.view_search import SearchOptions
+from semdb.types import FloatArray, Tolerance, Verdict
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,20 +25,25 @@ class ViewOptions:
     most: int = 12  # poses that are looked at roughly,
     roughly: int = 2  # on so many keyframes,
     looked_at: int = 4  # and those of them that are compared, beside the pose that was found
-    worth_laying: float = 0.7  # alike: these are made better by edges
+    worth_laying: float = 0.5  # alike: these are made better by edges,
+    worth_trusting: float = 0.65  # alike: where none is so much, others are looked for without keypoints
+    search: SearchOptions = field(default_factory=SearchOptions)
+    worth_seeing: float = 0.3  # roughly alike: these of them are looked at,
+    layings: int = 4  # and made better by edges so often, while it helps
     same: Tolerance = field(default_factory=lambda: Tolerance(0.25, 8.0))  # poses nearer than this are one
     least_windows: int = 1500
     least_known: float = 0.1  # share of the image that is predicted
-    least_alike: float = 0.95  # of what is predicted, to be sure: copies of a corridor turned round have up to .94
+    least_alike: float = 0.88  # of what is predicted, to be sure: copies of a corridor turned round have up to .72
     least_lead: float = 0.04  # share of the windows that both predict, by which a pose is better than another
     lead_windows: int = 120
     far_less: float = 0.2  # alike: so much less is beaten, whatever both predict
     nearby: Tolerance = field(default_factory=lambda: Tolerance(0.6, 10.0))  # nothing is there twice so near
     weak_agreement: float = 0.45  # keypoints that convince by fewer pairs than these are looked at again,
-    weak_first: int = 45
-    weak_likeness: float = 0.85  # where what is about them is less alike than this
-    more: int = 8  # keyframes that are matched besides
+    weak_first: int = 90
+    plausible: float = 0.55  # alike: what convinces so and looks less as predicted does not; right ones of a cabinet .6
+    more: int = 16  # keyframes that are matched besides
     least_inliers: int = 20
+    least_support: int = 8  # where edges were laid besides
     confidence: float = 0.95  # of a pose that is sure
 
     def accepting(self, accept: Tolerance | None) -> ViewOptions:
@@ -120,90 +117,14 @@ def is_same(pose: FloatArray, other: FloatArray, tolerance: Tolerance) -> bool:
     return metres < tolerance.metres and degrees < tolerance.degrees
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Viewing:
-    """How queries are compared with what a map predicts."""
-
-    cache: KeyframeCache
-    options: ViewOptions
-
-    def see(self, query: SmallView, pose: FloatArray) -> Seen:
-        """What is predicted from a pose ``[4, 4]``, compared with the query."""
-        return Seen(pose, compare_view(query, pose, self._from(query, pose)[0]))
-
-    def _from(self, query: SmallView, pose: FloatArray) -> tuple[list[PlacedView], bool]:
-        return self.cache.views_seen_from(pose, query, self.options.keyframes)
-
-    def _laid(self, query: SmallView, edges: ImageEdges, seen: Seen) -> Seen:
-        """The same with the edges of the query laid on those of the keyframes, where it is more alike then."""
-        rounds = self.options.edges
-        views = self._from(query, seen.world_from_camera)[0][: rounds.keyframes]
-        pose = seen.world_from_camera
-        fit = fit_edges(edges, self.cache.edges_of(views), pose, (*rounds.coarse[1:], *rounds.fine))
-        if fit is None:
-            return seen
-        found = self.see(query, fit.world_from_camera)
-        return found if found.alike > seen.alike else seen
-
-    def of(self, description: Description) -> SmallView | None:
-        """The query's own image."""
-        return None if description.grey is None else small_view(description.camera, description.grey)
-
-    def standing(self, search: Search, query: SmallView, description: Description) -> Standing | None:
-        """Of all poses that pairs with single keyframes give, the rivals and the pose that was found.
-
-        None where there is no pose, or the keyframes about the one that was found have no depth.
-        """
-        poses, options = hypotheses(search, self.options), self.options
-        if not poses or description.grey is None:
-            return None
-        places = [self._from(query, pose) for pose in poses]
-        own = []
-        if search.estimate is not None:  # which keypoints have refined
-            pose, (views, lacking) = poses.pop(0), places.pop(0)
-            own = [Seen(pose, compare_view(query, pose, views))]
-            if lacking and own[0].alike == 0:
-                return None
-        rough = sorted(
-            (-compare_view(query, pose, views[: options.roughly], (0,)).alike, n)
-            for n, (pose, (views, _)) in enumerate(zip(poses, places, strict=True))
-        )  # about how alike, in a tenth of the time
-        unseen = sum(alike == 0 and places[n][1] for alike, n in rough)
-        chosen = [n for _, n in rough[: options.looked_at]]
-        seen = [Seen(poses[n], compare_view(query, poses[n], places[n][0])) for n in chosen]
-        if not seen and not own:
-            return None
-        if any(one.alike >= options.worth_laying for one in seen):
-            edges = image_edges(description.camera, description.grey)
-            seen = [self._laid(query, edges, one) if one.alike >= options.worth_laying else one for one in seen]
-        return replace(stand([*own, *seen], options), unseen=unseen)
-
-
-def hypotheses(search: Search, options: ViewOptions) -> list[FloatArray]:
-    """Poses ``[4, 4]`` that may be right, the one that was found first, no two the same."""
-    found = [] if search.estimate is None else [search.estimate.world_from_camera]
-    found += [other.world_from_camera for other in search.others]
-    alone = []
-    for keyframe, matches in zip(search.keyframes, search.matches, strict=True):
-        if len(matches) < LEAST_PAIRS:
-            continue
-        pairs = join_pairs([matches])
-        own = robust_pnp(search.query, pairs, world_points_of(pairs, [keyframe]), search.pose, ITERATIONS)
-        if own is not None:
-            alone.append((int(own[1].sum()), invert_pose(own[0])))
-    alone.sort(key=lambda one: -one[0])
-    found += [pose for count, pose in alone if count >= LEAST_SHARE * alone[0][0]]
-    kept: list[FloatArray] = []
-    for pose in found:
-        if not any(is_same(pose, other, options.same) for other in kept):
-            kept.append(pose)
-    return kept[: options.most]
-
-
 def is_weak(evidence: Evidence, options: ViewOptions) -> bool:
     """Whether keypoints that convince do so by so few that another place may have as many."""
-    few = evidence.agreement < options.weak_agreement and evidence.first_of_best < options.weak_first
-    return few and evidence.likeness < options.weak_likeness
+    return evidence.agreement < options.weak_agreement and evidence.first_of_best < options.weak_first
+
+
+def vouches(evidence: Evidence | None, least: int, bounds: VerdictOptions) -> bool:
+    """Whether at least so many keypoints agree on a pose, and as exactly as a verdict needs."""
+    return evidence is not None and evidence.inliers >= least and is_precise(evidence, bounds)
 
 
 def judge_seen(
@@ -213,15 +134,19 @@ def judge_seen(
     own: bool,
     options: ViewOptions,
     bounds: VerdictOptions,
+    laid: bool = False,
 ) -> Judgement:
-    """What becomes of a verdict of keypoints. `own` is whether the best pose is that of `evidence`."""
+    """What becomes of a verdict of keypoints. `own`: the best pose is that of `evidence`; `laid`: by edges, too."""
     best = standing.best
-    enough = evidence is not None and evidence.inliers >= options.least_inliers and is_precise(evidence, bounds)
-    if own and evidence is not None and enough and standing.is_sure(options):
+    least = options.least_support if laid else options.least_inliers
+    if own and evidence is not None and vouches(evidence, least, bounds) and standing.is_sure(options):
         reason = f"{best.alike:.0%} of the image look as the map predicts, {evidence.inliers} keypoints agree"
         return Judgement(Verdict.LOCALIZED, max(judgement.confidence, options.confidence), reason)
     if judgement.verdict is not Verdict.LOCALIZED:
         return judgement
+    if own and best.count >= options.least_windows and best.alike < options.plausible:
+        reason = f"only {best.alike:.0%} of the image look as the map predicts"
+        return Judgement(Verdict.AMBIGUOUS, min(judgement.confidence, 0.5), reason)
     if own and not standing.unbeaten:
         return judgement
     return Judgement(Verdict.AMBIGUOUS, min(judgement.confidence, 0.5), "a pose elsewhere looks as much like the image")

@@ -10,6 +10,7 @@ import pytest
 from semdb.localization.confidence import Evidence
 from semdb.localization.predicted_view import PlacedView, best_seen, compare_view, small_view
 from semdb.localization.verdict import Judgement, VerdictOptions
+from semdb.localization.view_kernels import fill
 from semdb.localization.view_step import Seen, Standing, ViewOptions, beats, is_like, is_weak, judge_seen, stand
 from semdb.types import Camera, Float32Array, FloatArray, ImageArray, Verdict
 
@@ -129,9 +130,55 @@ def test_weak_keypoints_do_not_stand_against_another_pose_that_looks_as_much_lik
     assert judge_seen(CONVINCED, evidence(), poor, False, OPTIONS, VerdictOptions()).verdict is Verdict.AMBIGUOUS
 
 
+def test_weak_keypoints_do_not_stand_where_the_image_does_not_look_as_predicted() -> None:
+    right = seen(shifted(0.0))
+    unlike = replace(right, windows=replace(right.windows, likeness=np.zeros_like(right.windows.likeness)))
+    found = judge_seen(CONVINCED, evidence(), Standing(unlike, ()), True, OPTIONS, VerdictOptions())
+    assert found.verdict is Verdict.AMBIGUOUS
+    assert found.reason == "only 0% of the image look as the map predicts"
+
+
+def test_where_edges_were_laid_fewer_keypoints_vouch() -> None:
+    standing = Standing(seen(shifted(0.0)), ())
+    for inliers, verdict in ((8, Verdict.LOCALIZED), (7, Verdict.AMBIGUOUS)):
+        found = judge_seen(DOUBT, evidence(inliers=inliers), standing, True, OPTIONS, VerdictOptions(), laid=True)
+        assert found.verdict is verdict
+
+
+def test_an_image_of_little_contrast_looks_like_one_that_is_brighter() -> None:
+    """A query whose contrast was stretched, and one at a quarter of the light."""
+    grey, _ = look(shifted(0.0))
+    for dim, stretch in ((grey * 0.25, None), (np.clip((grey - 60.0) / 140 * 255, 0, 255), (60.0, 200.0))):
+        query = small_view(CAMERA, np.rint(dim).astype(np.uint8), stretch=stretch)
+        right, other = (compare_view(query, shifted(x), KEYFRAMES) for x in (0.0, 0.6))
+        assert right.alike > 0.97
+        assert other.alike < 0.8
+    stretched = small_view(CAMERA, np.full((240, 320), 255, np.uint8), stretch=(60.0, 200.0))
+    assert stretched.grey.max() == pytest.approx(200)
+
+
+def test_holes_between_depths_of_one_surface_are_closed() -> None:
+    nearest = np.full((6, 30), np.inf, np.float32)
+    nearest[:, :10], nearest[:, 13:18], nearest[:, 28:] = 2.0, 2.2, 5.0
+    filled = np.empty_like(nearest)
+    fill(nearest, filled)
+    assert filled[3, 10:13] == pytest.approx([1 / (0.5 * (1 - k / 4) + k / 4 / 2.2) for k in (1, 2, 3)], rel=1e-5)
+    assert np.isinf(filled[:, 18:28]).all()  # a wide one, from a thing to what lies behind
+    assert (filled[:, :10] == 2.0).all()
+
+
+@pytest.mark.parametrize(("away", "known"), [(0.0, True), (1.5, True), (4.0, False)])
+def test_what_a_keyframe_shows_too_coarsely_is_not_known(away: float, known: bool) -> None:
+    """A keyframe that saw the wall from so much farther away."""
+    far = shifted(0.0, 0.0, -away)
+    found = compare_view(small_view(CAMERA, look(shifted(0.0))[0]), shifted(0.0), [placed(1, far)])
+    assert (found.known > 0.9) is known
+    assert found.alike > 0.95 or not known
+
+
 @pytest.mark.parametrize(
     ("values", "weak"),
-    [({}, True), ({"agreement": 0.5}, False), ({"first_of_best": 60}, False), ({"likeness": 0.9}, False)],
+    [({}, True), ({"agreement": 0.5}, False), ({"first_of_best": 95}, False), ({"likeness": 1.0}, True)],
 )
 def test_which_keypoints_are_weak(values: dict[str, float], weak: bool) -> None:
     assert is_weak(evidence(**values), OPTIONS) is weak

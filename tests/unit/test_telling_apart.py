@@ -11,13 +11,15 @@ import pytest
 
 from semdb.localization.coarse import Proposal
 from semdb.localization.fine_step import FineStep
+from semdb.localization.laid_pose import LaidPose
 from semdb.localization.localizer_options import LocalizerOptions
 from semdb.localization.pose import estimate_pose, match_views
 from semdb.localization.predicted_view import PlacedView, SmallView, Windows, small_view
 from semdb.localization.search import Search, evidence_of
 from semdb.localization.telling_apart import tell_apart
 from semdb.localization.verdict import Judgement
-from semdb.localization.view_step import Seen, Standing, Viewing, ViewOptions
+from semdb.localization.view_step import Seen, Standing, ViewOptions
+from semdb.localization.viewing import Viewing
 from semdb.localization.views import ClassNumbers
 from semdb.types import Camera, ConsistentPose, Description, FloatArray, Tolerance, Verdict
 from tests.unit.localization_scene import Scene
@@ -43,6 +45,10 @@ class Told(Viewing):
     """One that is told how poses stand."""
 
     told: Standing | None = None
+    lies: LaidPose | None = None
+
+    def laid(self, *_: object) -> LaidPose | None:
+        return self.lies
 
     def of(self, description: Description) -> SmallView | None:
         return small_view(SMALL, GREY)
@@ -62,7 +68,9 @@ class NoNeighbours:
         return []
 
 
-def tell(points: int, standing: Standing, accept: Tolerance | None = None) -> tuple[Search, Judgement]:
+def tell(
+    points: int, standing: Standing, accept: Tolerance | None = None, lies: LaidPose | None = None
+) -> tuple[Search, Judgement]:
     """A query at the origin, whose keypoints were taken for a pose 5 m aside by a weak answer."""
     scene, numbers = Scene(3, points), ClassNumbers()
     query, keyframes = scene.query(np.eye(4), numbers), [scene.keyframe(1, scene.pose(0.1, 2), numbers)]
@@ -74,7 +82,7 @@ def tell(points: int, standing: Standing, accept: Tolerance | None = None) -> tu
     search.estimate = replace(found, world_from_camera=shifted(5.0))
     evidence = replace(evidence_of(search, found, 0), agreement=0.3, first_of_best=10, likeness=0.5)
     fine = FineStep(cast(Any, NoNeighbours()), (), options)
-    viewing = Told(cast(Any, None), ViewOptions(), standing)
+    viewing = Told(cast(Any, None), ViewOptions(), standing, lies)
     judgement, _ = tell_apart(fine, viewing, search, cast(Any, None), WEAK, evidence)
     return search, judgement
 
@@ -91,6 +99,19 @@ def test_a_sure_pose_has_the_verdict_of_its_own_keypoints() -> None:
     assert found.verdict is Verdict.AMBIGUOUS  # and not that of the pose 5 m aside
     assert "keypoints agree" in found.reason
     assert found.confidence != WEAK.confidence
+
+
+def test_edges_hold_a_sure_pose_of_which_keypoints_are_few() -> None:
+    lies = LaidPose(
+        world_from_camera=shifted(0.001), covariance=np.eye(6) * 1e-6, support=9, others=(), doubts=(), fits_well=True,
+        agrees="", better="", numbers={},
+    )  # fmt: skip
+    search, found = tell(22, Standing(seen(np.eye(4)), ()), lies=lies)
+    assert search.estimate is not None
+    assert search.estimate.inliers < 20
+    assert np.abs(search.estimate.world_from_camera[:3, 3] - [0.001, 0, 0]).max() < 0.005
+    assert found.verdict is Verdict.LOCALIZED
+    assert search.seen is search.estimate.world_from_camera
 
 
 def test_a_pose_that_looks_as_much_like_the_image_is_named() -> None:
@@ -119,6 +140,9 @@ class Places:
         return [PlacedView(1, pose, small_view(SMALL, GREY, depth))], False
 
     def edges_of(self, views: Sequence[PlacedView]) -> list[object]:
+        return []
+
+    def small_views(self, keyframes: Sequence[object]) -> list[PlacedView]:
         return []
 
 
