@@ -9,7 +9,9 @@ import numpy as np
 
 from semdb.geometry import pose_offset
 from semdb.localization.localizer_options import LocalizerOptions
+from semdb.localization.matching import Matches
 from semdb.localization.pose import estimate_pose, first_pose, match_views
+from semdb.localization.pose_options import PoseOptions
 from semdb.localization.recorded_errors import LeftOut
 from semdb.localization.verdict import convinces
 from semdb.localization.views import KeyframeView
@@ -20,8 +22,29 @@ def localized_among(own: KeyframeView, others: Sequence[KeyframeView], options: 
 
     Damaged points may be anywhere: nothing that is no number comes out.
     """
+    return localized_farther(own, others, options, len(others), 1)[0]
+
+
+def localized_farther(
+    own: KeyframeView, others: Sequence[KeyframeView], options: LocalizerOptions, count: int, times: int
+) -> list[LeftOut | None]:
+    """`own` as in `localized_among`, among the first `count` of `others`, then without the first of these, and so on.
+
+    Each time, of at most `times`, as if the keyframes nearest to it were not there. It is matched with each once.
+    """
     pose = replace(options.pose, use_query_depth=False)
     matches = match_views(own.view, others, pose)
+    starts = range(min(times, max(len(others), 1)))
+    return [_localized(own, others[n : n + count], matches[n : n + count], options, pose) for n in starts]
+
+
+def _localized(
+    own: KeyframeView,
+    others: Sequence[KeyframeView],
+    matches: Sequence[Matches],
+    options: LocalizerOptions,
+    pose: PoseOptions,
+) -> LeftOut | None:
     first = first_pose(own.view, others, matches, pose)
     if first is None or not convinces(first, options.verdict):
         return None

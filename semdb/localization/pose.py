@@ -229,7 +229,7 @@ def estimate_pose(
         return None
     pose, covariance = refined.camera_from_world, refined.covariance
     estimate = _estimate(query, keyframes, pairs, error, pose, covariance, first, options)
-    if estimate is None:
+    if estimate is None or covariance is None:
         return None
     keep = error < options.inlier_px
     aligned = int(np.count_nonzero(seen.found))
@@ -240,7 +240,7 @@ def estimate_pose(
         return found
     # by what this query shows, what its keyframes' recordings do, and what is usual
     measured = weighted([keyframe.pose_errors for keyframe in keyframes], estimate.per_keyframe)
-    return replace(found, recorded=recorded_errors(shrunk(refined.evident, measured), at))
+    return replace(found, recorded=recorded_errors(shrunk(refined.evident, measured), at, covariance))
 
 
 def recorded_covariance(estimate: PoseEstimate) -> FloatArray | None:

@@ -17,30 +17,40 @@ from semdb.types import FloatArray, PoseErrors
 PLACE, TURN = slice(0, 3), slice(3, 6)
 LEAST_M, LEAST_RAD = 1e-5, 1e-5  # below, it is nothing
 ROUNDS = 60  # of the fit
-USUAL = PoseErrors(0.006, 0.006, 3.0, 6.0)  # of a recording of which nothing is known, as good as so many numbers
+USUAL = PoseErrors(0.008, 0.007, 2.0, 2.0)  # of a recording of which nothing is known, as good as so many numbers
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorModel:
     """What errors of recorded poses make of an answer; docs/localization.md says what was fitted on what.
 
-    A place is off in proportion to a power of the distance (`pose_distances`) of the nearest keyframe, not less than at
-    `place_near`, and to a power of how much one keyframe is `alone`: what several have wrong cancels in part. A turn
-    is off likewise, but for that. Besides it is off by the share `clock` of the difference between the turns of query
-    and keyframes during the readout, since the clock of the poses is not that of the images.
+    A place is off in proportion to the distance (`pose_distances`) of the nearest keyframe, not less than at
+    `place_near`, hardly more than at `place_far`, and to a power of how much one keyframe is `alone`: what several
+    have wrong cancels in part. Trackers hold a camera best along its view: `axes` are shares of the variance of a place
+    (right, down, forward). A turn is off likewise, to a power of the distance. Besides it is off by the share `clock`
+    of the difference between the turns of query and keyframes during the readout, since the clock of the poses is not
+    that of the images.
+
+    Where poses are off, so is more of a camera than images show by themselves: their covariance counts `place_images`
+    and `turn_images` times. Keyframes left out stand in holes that they make themselves: what lies between keyframes is
+    off by the share `between` of that.
     """
 
-    place_power: float = 1.1
-    place_near: float = 0.2
-    alone_power: float = 0.5
-    turn_power: float = 1.25
-    turn_near: float = 0.3
+    place_near: float = 0.1
+    place_far: float = 3.0
+    alone_power: float = 0.3
+    axes: tuple[float, float, float] = (1.3, 1.0, 0.7)
+    turn_power: float = 0.8
+    turn_near: float = 0.1
     clock: float = 0.33
-    clock_from_rad: float = 0.002  # of a recording's errors: with less its clock is the images'
+    off_from_m: float = 0.001  # of a recording's errors: with less its images are believed as they are
+    off_from_rad: float = 0.002  # likewise, and its clock is the images'
+    place_images: float = 1.2
+    turn_images: float = 2.0
+    between: float = 0.74
     tail: float = 5.0  # degrees of freedom of Student's t that errors of keyframes are taken to have: some are far off
-    alike: float = 0.5  # of the numbers of keyframes count: neighbours err alike
     usual: PoseErrors = USUAL
-    own: float = 0.25  # of what a query itself shows counts
+    own: float = 0.1  # of what a query itself shows counts
     exact: float = 0.2  # of what is usual counts where keyframes show that poses are not off at all: rendered ones
 
 
@@ -50,13 +60,14 @@ MODEL = ErrorModel()
 @dataclass(frozen=True, slots=True, eq=False)
 class AtQuery:
     """Where errors of recorded poses meet a query: distances of the nearest keyframe (`pose_distances`), for its place
-    and its turn, by how much more than its keyframes it turned during the readout, ``[3]`` rad in the world, and the
-    sum of squares of the keyframes' shares of the pairs (1: all are of one).
+    and its turn, by how much more than its keyframes it turned during the readout, ``[3]`` rad in the world, the
+    sum of squares of the keyframes' shares of the pairs (1: all are of one), and its `axes` ``[3, 3]`` in the world.
     """
 
     nearest: tuple[float, float]
     turn: FloatArray
     alone: float
+    axes: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,11 +81,14 @@ class LeftOut:
     at: AtQuery
 
 
-def measured(found: Sequence[LeftOut], model: ErrorModel = MODEL) -> PoseErrors:
-    """How far the poses of a recording are off at a distance of 1, by its keyframes; nothing known of none."""
+def measured(found: Sequence[LeftOut], keyframes: int | None = None, model: ErrorModel = MODEL) -> PoseErrors:
+    """How far the poses of a recording are off at a distance of 1; nothing known of none.
+
+    `found` may have each of its `keyframes` more than once, among others that are farther and farther.
+    """
+    count = len(found) if keyframes is None else keyframes
     metres, radians = (_spread(found, part, model) for part in (PLACE, TURN))
-    numbers = 3.0 * len(found) * model.alike
-    return PoseErrors(metres, radians, numbers, numbers, len(found))
+    return PoseErrors(metres, radians, 3.0 * count, 3.0 * count, count)
 
 
 def _spread(found: Sequence[LeftOut], part: slice, model: ErrorModel) -> float:
@@ -85,7 +99,9 @@ def _spread(found: Sequence[LeftOut], part: slice, model: ErrorModel) -> float:
     if not found:
         return 0.0
     errors = np.array([one.error[part] for one in found])
-    fixed = np.array([one.covariance[part, part] + _of_clock(one.at, part, model) for one in found])
+    times = model.turn_images if part == TURN else model.place_images
+    narrower = (model.tail - 2) / model.tail  # than its covariance is the scale of Student's t
+    fixed = narrower * np.array([times * one.covariance[part, part] + _of_clock(one.at, part, model) for one in found])
     grows = np.array([_growth(one.at, part, model) ** 2 for one in found])
     variance = float((errors**2).mean())
     for _ in range(ROUNDS):
@@ -94,14 +110,15 @@ def _spread(found: Sequence[LeftOut], part: slice, model: ErrorModel) -> float:
         weight = (model.tail + 3) / (model.tail + (scaled * errors).sum(axis=1))
         seen, expected = (weight * grows * (scaled**2).sum(axis=1)).sum(), (grows * np.trace(inverse, 0, 1, 2)).sum()
         variance = max(variance * float(seen / expected), 1e-14)
-    return float(np.sqrt(variance * model.tail / (model.tail - 2)))
+    return float(np.sqrt(variance / narrower))
 
 
 def _growth(at: AtQuery, part: slice, model: ErrorModel) -> float:
     """How many times as far as at a distance of 1 it is off."""
     if part == TURN:
         return float(np.hypot(at.nearest[1], model.turn_near) ** model.turn_power)
-    return float(np.hypot(at.nearest[0], model.place_near) ** model.place_power * at.alone**model.alone_power)
+    distance = np.hypot(at.nearest[0], model.place_near)
+    return float(distance / np.hypot(1.0, distance / model.place_far) * at.alone**model.alone_power)
 
 
 def _of_clock(at: AtQuery, part: slice, model: ErrorModel) -> FloatArray:
@@ -159,12 +176,19 @@ def _scaled(one: PoseErrors, share: float) -> PoseErrors:
     return PoseErrors(one.position_m, one.rotation_rad, one.position_freedom * share, one.rotation_freedom * share)
 
 
-def recorded_errors(errors: PoseErrors, at: AtQuery, model: ErrorModel = MODEL) -> FloatArray:
-    """Covariance ``[6, 6]`` of how far a pose recorded where the query is would be off what the images show."""
-    found = np.zeros((6, 6))
-    believed = min(errors.rotation_rad / model.clock_from_rad, 1.0) ** 4
-    for part, of in ((PLACE, errors.position_m), (TURN, errors.rotation_rad)):
-        found[part, part] = (of * _growth(at, part, model)) ** 2 * np.eye(3) + believed * _of_clock(at, part, model)
+def recorded_errors(errors: PoseErrors, at: AtQuery, images: FloatArray, model: ErrorModel = MODEL) -> FloatArray:
+    """Covariance ``[6, 6]`` of how far a pose recorded where the query is would be off what the images show.
+
+    `images` ``[6, 6]`` is what these leave open; with it the sum is that of the answer.
+    """
+    placed = min(errors.position_m / model.off_from_m, 1.0) ** 4
+    turned = min(errors.rotation_rad / model.off_from_rad, 1.0) ** 4
+    more = np.repeat([1.0 + placed * (model.place_images - 1.0), 1.0 + turned * (model.turn_images - 1.0)], 3) ** 0.5
+    found: FloatArray = images * (np.outer(more, more) - 1.0)
+    place = (model.between * errors.position_m * _growth(at, PLACE, model)) ** 2
+    turn = (model.between * errors.rotation_rad * _growth(at, TURN, model)) ** 2
+    found[PLACE, PLACE] += place * (at.axes * np.array(model.axes)) @ at.axes.T
+    found[TURN, TURN] += turn * np.eye(3) + turned * _of_clock(at, TURN, model)
     return found
 
 
@@ -176,4 +200,4 @@ def at_query(
     """
     shares = np.maximum(pairs, 1e-3) / np.maximum(pairs, 1e-3).sum()
     more: FloatArray = world_from_camera[:3, :3] @ (turns[0] - shares @ turns[1:])
-    return AtQuery(nearest, more, float(shares @ shares))
+    return AtQuery(nearest, more, float(shares @ shares), world_from_camera[:3, :3])

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from semdb.localization.keyframe_cache import KeyframeCache
     from semdb.localization.recorded_errors import LeftOut
 
-REVISION = 2  # of the computation: another one makes what is stored out of date
+REVISION = 3  # of the computation: another one makes what is stored out of date
 FIRST_LEAST, FIRST_MOST = 8, 16  # keyframes that are measured when a recording of so many at least is ingested
 
 
@@ -35,6 +35,7 @@ class ErrorOptions:
 
     most: int = 24  # that are localized of a recording, evenly over it
     neighbours: int = 5
+    times: int = 3  # each: then without the nearest, and without the two nearest, which is farther off
     farthest: float = 6.0  # of `pose_distances`: further off nothing is seen in common
 
 
@@ -108,38 +109,41 @@ def errors_of(
     from semdb.localization.recorded_errors import measured
 
     # by measured points, refined or not: the numbers are of the recording, whatever steps were run before
-    cache, told = KeyframeCache(store, map_id, refined=False), []
+    cache, told, found = KeyframeCache(store, map_id, refined=False), [], 0
     for count, keyframe_id in enumerate(spread_over(ids, options.most), start=1):
-        one = errors_at(cache, store, map_id, keyframe_id, ids, options)
-        told += [one] if one is not None else []
+        here = errors_at(cache, store, map_id, keyframe_id, ids, options)
+        told += here
+        found += bool(here)
         if progress is not None:
             progress(count)
-    return measured(told) if told else None
+    return measured(told, found) if told else None
 
 
 def errors_at(
     cache: KeyframeCache, store: Store, map_id: int, keyframe_id: int, ids: Sequence[int], options: ErrorOptions
-) -> LeftOut | None:
-    """One keyframe localized among those of `ids` that are nearest; None where it is not.
+) -> list[LeftOut]:
+    """One keyframe localized among those of `ids` that are nearest, then among farther ones, where it is found.
 
     Raises CodecError where models of the map are damaged.
     """
-    from semdb.localization.cross_validation import localized_among
+    from semdb.localization.cross_validation import localized_farther
     from semdb.localization.localizer_options import LocalizerOptions
 
     known, poses = cache.poses()
     if keyframe_id not in known:
-        return None
+        return []
     place = poses[known.index(keyframe_id)]
-    others, _ = cache.near(place, options.farthest, (keyframe_id,), options.neighbours, ids)
+    others, _ = cache.near(place, options.farthest, (keyframe_id,), options.neighbours + options.times - 1, ids)
     own, near = cache.views([keyframe_id]), cache.views(others)
     if not own or not near:
-        return None
+        return []
     width = own[0].view.descriptors.shape[1]  # rows of another one are damaged: the step of points says which
     keyframes = [keyframe for keyframe in near if keyframe.view.descriptors.shape[1] == width]
     if not keyframes:
-        return None
-    return localized_among(own[0], keyframes, LocalizerOptions().for_models(store.map_models(map_id)))
+        return []
+    localizer = LocalizerOptions().for_models(store.map_models(map_id))
+    found = localized_farther(own[0], keyframes, localizer, options.neighbours, options.times)
+    return [one for one in found if one is not None]
 
 
 def spread_over(ids: Sequence[int], most: int) -> list[int]:

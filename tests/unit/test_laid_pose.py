@@ -16,6 +16,7 @@ from semdb.localization.laid_pose import (
     covariance_from,
     fused,
     judge_with,
+    laid_recorded,
     may_overrule,
     shared_doubts,
     with_view,
@@ -80,6 +81,16 @@ def test_many_measurements_are_not_believed_to_be_independent() -> None:
     assert sigma_deg == pytest.approx(np.degrees(0.007), rel=0.01)
     apart = np.diag([0.02**2, 0, 0, 0, 0, 0])
     assert sigmas(covariance_from(information, apart, 60.0))[0] == pytest.approx(0.0404, rel=0.01)
+
+
+def test_the_covariance_of_an_answer_counts_recorded_poses_that_the_verdict_does_not_look_at() -> None:
+    information = np.diag([1e9, 1e6, 1e6, 1e8, 1e8, 1e8])
+    covariance = covariance_from(information, np.eye(6) * 1e-4, 60.0)
+    answer = covariance + laid_recorded(covariance)
+    seen = np.diag(covariance) - np.repeat([0.006, 0.007], 3) ** 2
+    np.testing.assert_allclose(np.diag(answer), 1.5 * seen + np.repeat([0.005, 0.005], 3) ** 2)
+    exact = covariance_from(np.eye(6) * 1e12, np.zeros((6, 6)), 60.0)
+    assert sigmas(exact + laid_recorded(exact))[0] == pytest.approx(0.005, rel=1e-3)
 
 
 def test_two_estimates_in_one_lie_between_them() -> None:
