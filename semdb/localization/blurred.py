@@ -40,7 +40,7 @@ def extractor_for(models: Sequence[ModelInfo], options: BlurOptions) -> FeatureE
     On one thread: work that is spread over the pool of threads must not wait for others of the pool.
     """
     info = next((info for info in models if info.role == "features"), None)
-    if info is None or info.name != "surf":
+    if info is None or info.name not in ("surf", "surf:weak"):
         return None
     from semdb.perception.features.surf_features import SurfFeatures
 

@@ -151,3 +151,20 @@ def test_what_is_no_grey_image_is_refused(spec: str) -> None:
 def test_unknown_spec_names_the_known_ones() -> None:
     with pytest.raises(UsageError, match="surf, sift, orb"):
         load_features("brisk", settings())
+
+
+def test_weak_keypoints_count_only_where_others_are_few() -> None:
+    usual, weak = load_features("surf", Settings()), load_features("surf:weak", Settings())
+    assert usual.info != weak.info
+    assert '"few":600' in weak.info.config
+    random = np.random.default_rng(0)
+    rich = cv2.GaussianBlur(random.integers(0, 255, (480, 640), np.uint8), (0, 0), 2)
+    one, two = usual.extract(rich), weak.extract(rich)
+    assert len(one) >= 600
+    assert np.array_equal(one.xy, two.xy)
+    assert np.array_equal(one.descriptors, two.descriptors)
+    plain = np.rint(100 + (rich - rich.mean()) * 0.12).astype(np.uint8)
+    few, more = usual.extract(plain), weak.extract(plain)
+    assert len(few) < 600
+    assert len(more) > len(few)
+    assert np.array_equal(more.xy[: len(few)], few.xy)

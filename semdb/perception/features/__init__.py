@@ -7,17 +7,20 @@ from semdb.perception.protocols import FeatureExtractor
 from semdb.settings import Settings
 
 KNOWN = ("surf", "sift", "orb")
+WEAK = "surf:weak"  # SURF with weak keypoints of images that give few
 
 
 def load_features(spec: str, settings: Settings) -> FeatureExtractor:
-    """The local feature of a `spec`: ``surf``, ``sift``, ``orb`` or ``onnx:FILE``; ``settings.max_keypoints`` an image.
+    """The local feature of a `spec`: ``surf``, ``surf:weak``, ``sift``, ``orb`` or ``onnx:FILE``.
+
+    An image has ``settings.max_keypoints`` at most.
 
     Raises UsageError for another spec, ModelError when a file is missing or is no feature.
     """
-    if spec == "surf":
+    if spec in ("surf", WEAK):
         from semdb.perception.features.surf_features import SurfFeatures
 
-        return SurfFeatures(max_keypoints=settings.max_keypoints, threads=settings.threads)
+        return SurfFeatures(max_keypoints=settings.max_keypoints, threads=settings.threads, weak=spec == WEAK)
     if spec == "sift":
         from semdb.perception.features.sift import SiftFeatures
 
