@@ -290,7 +290,14 @@ def rows_of(url: str, name: str) -> dict[str, list[tuple[object, ...]]]:
     with open_store(url) as store, store.engine.connect() as connection:
         found: dict[str, list[tuple[object, ...]]] = {}
         for table in tables.metadata.sorted_tables:
-            if table.name in ("maps", "queries", "keyframe_changes", "refinements"):
+            if table.name in (
+                "maps",
+                "queries",
+                "keyframe_changes",
+                "refinements",
+                "map_completions",
+                "landmark_parts",
+            ):
                 continue
             columns = [
                 c for c in table.columns if not c.foreign_keys and c.name not in ("id", "created_at", "finished_at")
