@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from sqlalchemy import select
 
-from semdb.database import retry, tables
+from semdb.database import landmark_tables, retry, tables
 from semdb.database.ids import SharedIds
 from semdb.database.landmark_records import (
     GravityRow,
@@ -191,4 +191,8 @@ def stored_landmarks(store: Store, map_id: int) -> list[int]:
     written = retry.write(store.engine, lambda connection: replace_landmarks(connection, map_id, found, keep_ids))
     assert written == len(things)
     with store.engine.connect() as connection:
-        return list(connection.execute(select(tables.landmarks.c.id).order_by(tables.landmarks.c.id)).scalars())
+        return list(
+            connection.execute(
+                select(landmark_tables.landmarks.c.id).order_by(landmark_tables.landmarks.c.id)
+            ).scalars()
+        )

@@ -16,7 +16,7 @@ import numpy as np
 from sqlalchemy import insert, select
 
 from semdb.api.finding import find
-from semdb.database import tables
+from semdb.database import landmark_tables, tables
 from semdb.database.ids import SharedIds
 from semdb.database.store import Store, open_store
 
@@ -66,10 +66,10 @@ def fill(store: Store, number: int, per_map: int = 1000) -> None:
             if rng.random() < 0.2
         ]
         with store.engine.begin() as connection:
-            connection.execute(insert(tables.landmarks), rows)
-            connection.execute(insert(tables.landmark_categories), perhaps)
+            connection.execute(insert(landmark_tables.landmarks), rows)
+            connection.execute(insert(landmark_tables.landmark_categories), perhaps)
             connection.execute(
-                insert(tables.landmark_relations),
+                insert(landmark_tables.landmark_relations),
                 [
                     {
                         **{"landmark_id": a, "kind": kind, "other_landmark_id": b},
@@ -105,7 +105,7 @@ def main() -> None:
         url = given.url or f"sqlite:///{Path(folder) / 'landmarks.sqlite3'}"
         with open_store(url, create=True) as store:
             with store.engine.connect() as connection:
-                empty = connection.execute(select(tables.landmarks.c.id).limit(1)).first() is None
+                empty = connection.execute(select(landmark_tables.landmarks.c.id).limit(1)).first() is None
             if empty:
                 fill(store, given.landmarks)
             measure(store, 8)

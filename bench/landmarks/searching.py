@@ -34,7 +34,7 @@ from bench.landmarks.rooms import (
 )
 from bench.landmarks.scores import SEEN, as_landmark, main_label
 from semdb.api.finding import find
-from semdb.database import tables
+from semdb.database import landmark_tables, tables
 from semdb.database.ids import SharedIds
 from semdb.database.landmark_search import NEAR, ON
 from semdb.database.store import Store, open_store
@@ -132,7 +132,9 @@ def write(
     map_id = store.ensure_map(map_name)
     axes = upright_axes(found.gravity.up)
     with store.engine.begin() as connection:
-        first = int(connection.execute(tables.landmarks.select().with_only_columns(_greatest())).scalar() or 0) + 1
+        first = (
+            int(connection.execute(landmark_tables.landmarks.select().with_only_columns(_greatest())).scalar() or 0) + 1
+        )
         keys = [first + number for number in range(len(found.landmarks))]
         rows = []
         for key, one in zip(keys, found.landmarks, strict=True):
@@ -148,7 +150,7 @@ def write(
                     "state": str(one.state),
                 }
             )
-        connection.execute(insert(tables.landmarks), rows)
+        connection.execute(insert(landmark_tables.landmarks), rows)
         related = [
             {
                 **{"landmark_id": keys[r.one], "kind": str(r.kind), "other_landmark_id": keys[r.other]},
@@ -161,7 +163,10 @@ def write(
             for key, one in zip(keys, found.landmarks, strict=True)
             for k, share in perhaps(one.evidence, one.category, named_of(one)).items()
         ]
-        for table, listed in ((tables.landmark_relations, related), (tables.landmark_categories, others)):
+        for table, listed in (
+            (landmark_tables.landmark_relations, related),
+            (landmark_tables.landmark_categories, others),
+        ):
             if listed:
                 connection.execute(insert(table), listed)
     return keys
@@ -170,7 +175,7 @@ def write(
 def _greatest() -> Any:
     from sqlalchemy import func
 
-    return func.max(tables.landmarks.c.id)
+    return func.max(landmark_tables.landmarks.c.id)
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from typing import Any
 
 from sqlalchemy import Connection, Engine, Table, insert, or_, select
 
-from semdb.database import checked, retry, tables
+from semdb.database import checked, landmark_tables, retry, tables
 from semdb.database.copying_landmarks import copy_landmarks
 from semdb.database.ids import new_id
 from semdb.database.links import LARGEST_ID
@@ -82,7 +82,7 @@ def copy_map(source: Engine, map_id: int, target: Engine, name: str, *, progress
             f"the map {name!r} was described anew by another encoder while it was copied: remove the copy and start "
             "again"
         )
-    of_map = (tables.landmarks, tables.landmark_categories, tables.completed_categories)
+    of_map = (landmark_tables.landmarks, landmark_tables.landmark_categories, tables.completed_categories)
     used = [tables.categories.c.id.in_(select(t.c.category_id).where(t.c.map_id == map_id)) for t in of_map]
     names = _rows(source, select(tables.categories.c.id).where(or_(*used)))
     known = retry.write(target, lambda connection: _categories(copy, connection, names))

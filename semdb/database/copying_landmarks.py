@@ -7,7 +7,7 @@ from typing import Any
 
 from sqlalchemy import Connection, Engine, Table, insert, select
 
-from semdb.database import retry, tables
+from semdb.database import landmark_tables, retry, tables
 from semdb.database.ids import new_id
 
 Place = tuple[str, int, int]  # recording, frame, ordinal; -1 for the keyframe itself
@@ -21,8 +21,8 @@ def copy_landmarks(
     `categories` gives the ids of classes in the target by those in the source. What turned out to be another landmark
     is not copied: those ids were of the other database.
     """
-    m = tables.landmarks.c
-    rows = _rows(source, select(tables.landmarks).where(m.map_id == map_id).order_by(m.id))
+    m = landmark_tables.landmarks.c
+    rows = _rows(source, select(landmark_tables.landmarks).where(m.map_id == map_id).order_by(m.id))
     if not rows or _rows(target, select(m.id).where(m.map_id == target_map_id).limit(1)):
         return
     here, there = _places(source, map_id), _places(target, target_map_id)
@@ -33,11 +33,11 @@ def copy_landmarks(
     hanging = {
         table: _rows(source, select(table).where(table.c.landmark_id.in_(mine)))
         for table in (
-            tables.landmark_sightings,
-            tables.landmark_views,
-            tables.landmark_visits,
-            tables.landmark_relations,
-            tables.landmark_categories,
+            landmark_tables.landmark_sightings,
+            landmark_tables.landmark_views,
+            landmark_tables.landmark_visits,
+            landmark_tables.landmark_relations,
+            landmark_tables.landmark_categories,
         )
     }
     recordings = _recordings(source, map_id, target, target_map_id)
@@ -50,10 +50,10 @@ def copy_landmarks(
             values |= {"map_id": target_map_id, "category_id": categories[int(row["category_id"])]}
             for name in ("first_keyframe_id", "last_keyframe_id"):
                 values[name] = None if row[name] is None else keyframes.get(int(row[name]))
-            ids[int(row["id"])] = new_id(connection, tables.landmarks, values)
-        for row in hanging[tables.landmark_relations]:
+            ids[int(row["id"])] = new_id(connection, landmark_tables.landmarks, values)
+        for row in hanging[landmark_tables.landmark_relations]:
             row["other_category_id"] = categories.get(int(row["other_category_id"] or 0))
-        for row in hanging[tables.landmark_categories]:
+        for row in hanging[landmark_tables.landmark_categories]:
             row |= {"map_id": target_map_id, "category_id": categories[int(row["category_id"])]}
         for table, found in hanging.items():
             _insert(connection, table, found, ids, objects, recordings)

@@ -14,6 +14,7 @@ from typing import Any
 from sqlalchemy import Column, Connection, Engine, delete, insert, literal, select, update
 
 from semdb.database import retry
+from semdb.database.landmark_tables import landmark_merges, landmark_parts, landmarks
 from semdb.database.records import ChangeKind, Deleted, ItemState, RecordingState
 from semdb.database.tables import (
     cameras,
@@ -21,9 +22,6 @@ from semdb.database.tables import (
     ingest_items,
     keyframe_changes,
     keyframes,
-    landmark_merges,
-    landmark_parts,
-    landmarks,
     map_models,
     maps,
     planned_links,

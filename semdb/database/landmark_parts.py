@@ -24,7 +24,7 @@ from sqlalchemy.sql.elements import ColumnElement
 
 from semdb.database import checked, retry
 from semdb.database.blobs import in_bulk
-from semdb.database.tables import landmark_parts
+from semdb.database.landmark_tables import landmark_parts
 
 MAGIC = b"SDBL"
 _NOT_COMPRESSED = cast(type[Exception], isal_zlib.error)

@@ -11,7 +11,8 @@ import numpy as np
 from sqlalchemy import Engine, or_, select
 
 from semdb.database import checked, retry
-from semdb.database.tables import categories, keyframes, landmark_relations, landmarks, recordings
+from semdb.database.landmark_tables import landmark_relations, landmarks
+from semdb.database.tables import categories, keyframes, recordings
 from semdb.errors import CodecError
 from semdb.types import FloatArray
 

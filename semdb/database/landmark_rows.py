@@ -23,11 +23,7 @@ from semdb.database.landmark_records import (
     LandmarkRow,
     LandmarkSet,
 )
-from semdb.database.reading import Bad, depth_scale_of, keyframe_heads
-from semdb.database.records import KeyframeHead
-from semdb.database.tables import (
-    categories,
-    keyframe_images,
+from semdb.database.landmark_tables import (
     landmark_categories,
     landmark_merges,
     landmark_relations,
@@ -36,9 +32,10 @@ from semdb.database.tables import (
     landmark_visits,
     landmarks,
     map_gravity,
-    objects,
-    recordings,
 )
+from semdb.database.reading import Bad, depth_scale_of, keyframe_heads
+from semdb.database.records import KeyframeHead
+from semdb.database.tables import categories, keyframe_images, objects, recordings
 from semdb.errors import CodecError
 
 LANDMARKS = STEP

@@ -32,18 +32,14 @@ from sqlalchemy.sql.elements import ColumnElement
 from sqlalchemy.sql.selectable import Subquery
 
 from semdb.database import retry
-from semdb.database.tables import (
-    categories,
-    keyframes,
+from semdb.database.landmark_tables import (
     landmark_categories,
     landmark_relations,
     landmark_sightings,
     landmark_views,
     landmarks,
-    maps,
-    objects,
-    recordings,
 )
+from semdb.database.tables import categories, keyframes, maps, objects, recordings
 
 NEAR = ("near", "next_to", "on", "in")
 ON = ("on",)

@@ -9,18 +9,9 @@ from sqlalchemy import BigInteger, Connection, Engine, cast, func, select
 
 from semdb.database import checked, retry
 from semdb.database.exact_sums import exact_sum
+from semdb.database.landmark_tables import landmark_sightings, landmarks, map_gravity
 from semdb.database.refinements import MICRO, map_state_of, within
-from semdb.database.tables import (
-    categories,
-    keyframes,
-    landmark_sightings,
-    landmarks,
-    loop_closures,
-    map_gravity,
-    objects,
-    recordings,
-    refinements,
-)
+from semdb.database.tables import categories, keyframes, loop_closures, objects, recordings, refinements
 
 _UP = ("up_x", "up_y", "up_z")
 

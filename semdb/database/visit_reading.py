@@ -13,15 +13,8 @@ from semdb.database import checked, retry
 from semdb.database.codecs import decode_array
 from semdb.database.landmark_records import LandmarkVisit
 from semdb.database.landmark_rows import CHUNK, VISIT_COUNTS
-from semdb.database.tables import (
-    categories,
-    keyframes,
-    landmark_sightings,
-    landmark_visits,
-    landmarks,
-    objects,
-    recordings,
-)
+from semdb.database.landmark_tables import landmark_sightings, landmark_visits, landmarks
+from semdb.database.tables import categories, keyframes, objects, recordings
 from semdb.errors import CodecError
 from semdb.types import Float32Array
 

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from semdb.api.changing import changes_of
 from semdb.cli.main import app
-from semdb.database import tables
+from semdb.database import landmark_tables, tables
 from semdb.database.copying import copy_map
 from semdb.database.landmark_records import GravityRow, LandmarkRow, LandmarkSet, LandmarkSighting, LandmarkVisit
 from semdb.database.landmark_rows import LANDMARKS, replace_landmarks
@@ -82,7 +82,11 @@ def stored(store: Store) -> tuple[int, list[int]]:
         found,
     )
     with store.engine.connect() as connection:
-        return map_id, list(connection.execute(select(tables.landmarks.c.id).order_by(tables.landmarks.c.id)).scalars())
+        return map_id, list(
+            connection.execute(
+                select(landmark_tables.landmarks.c.id).order_by(landmark_tables.landmarks.c.id)
+            ).scalars()
+        )
 
 
 def test_what_changed(store: Store) -> None:

@@ -17,7 +17,7 @@ import pytest
 from sqlalchemy import delete, update
 
 import semdb
-from semdb.database import tables
+from semdb.database import landmark_tables, tables
 from semdb.database.query_log import QueryFilter
 from semdb.database.scene_reading import scene_state
 from semdb.database.store import Store
@@ -245,11 +245,11 @@ def test_the_state_of_a_scene_follows_all_that_it_shows(store: Store) -> None:
     states = [scene_state(store.engine, map_id)]
     assert scene_state(store.engine, map_id) == states[0]
     changes = [
-        update(tables.landmarks).where(tables.landmarks.c.id == 1).values(yaw=0.2),
-        update(tables.landmarks).where(tables.landmarks.c.id == 1).values(state="gone"),
-        update(tables.map_gravity).values(up_x=0.6, up_z=0.8),
+        update(landmark_tables.landmarks).where(landmark_tables.landmarks.c.id == 1).values(yaw=0.2),
+        update(landmark_tables.landmarks).where(landmark_tables.landmarks.c.id == 1).values(state="gone"),
+        update(landmark_tables.map_gravity).values(up_x=0.6, up_z=0.8),
         update(tables.keyframes).where(tables.keyframes.c.id == keyframes[0]).values(tx=0.5),
-        delete(tables.landmarks).where(tables.landmarks.c.id == 2),
+        delete(landmark_tables.landmarks).where(landmark_tables.landmarks.c.id == 2),
     ]
     for statement in changes:
         with store.engine.begin() as connection:
