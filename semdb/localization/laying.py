@@ -19,8 +19,9 @@ from semdb.localization.laid_pose import (
     may_overrule,
     with_view,
 )
-from semdb.localization.pose import PoseEstimate, find_rival
+from semdb.localization.pose import PoseEstimate
 from semdb.localization.predicted_view import Windows, compare_view, small_view
+from semdb.localization.rivals import find_rival
 from semdb.localization.search import Search, evidence_of
 from semdb.localization.surface_search import search_surfaces
 from semdb.localization.surface_step import SurfaceVerdictOptions, weigh_surfaces, with_edges

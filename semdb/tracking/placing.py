@@ -22,9 +22,9 @@ from semdb.localization.pose import (
     image_spread,
     match_views,
     pinhole,
-    rival_pose,
     robust_pnp,
 )
+from semdb.localization.rivals import rival_pose
 from semdb.localization.verdict import judge
 from semdb.localization.views import KeyframeView, View
 from semdb.tracking.options import PlacingOptions

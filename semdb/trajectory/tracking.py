@@ -20,9 +20,9 @@ from semdb.localization.pose import (
     first_pose,
     image_spread,
     match_views,
-    rival_pose,
     robust_pnp,
 )
+from semdb.localization.rivals import rival_pose
 from semdb.localization.verdict import judge
 from semdb.localization.views import KeyframeView, View
 from semdb.trajectory.options import TrajectoryOptions

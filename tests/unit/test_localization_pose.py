@@ -14,14 +14,13 @@ from semdb.geometry.sensor import depth_noise
 from semdb.localization.bundle_kernels import depth_sigma
 from semdb.localization.matching import Evidence, MatchingOptions
 from semdb.localization.pose import (
-    _iterations_for,
     estimate_pose,
     first_pose,
     match_view,
     recorded_covariance,
-    rival_pose,
 )
 from semdb.localization.pose_options import PoseOptions
+from semdb.localization.rivals import _iterations_for, rival_pose
 from semdb.localization.views import ClassNumbers, make_keyframe_view
 from tests.unit.localization_scene import CAMERA, DISTORTED, Scene
 
