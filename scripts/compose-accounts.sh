@@ -11,10 +11,10 @@ semdb_password() {
 # All tables and views but the tokens and jobs of the service; CREATE lets rights be given before there is a table.
 semdb_readable() {
   for table in \
-    alembic_version cameras categories class_confusions cnn_vectors descriptors frame_views ingest_items \
+    alembic_version cameras categories class_confusions cnn_vectors completed_categories descriptors frame_views ingest_items \
     keyframe_categories keyframe_changes keyframe_images keyframe_qualities keyframes keypoints \
-    landmark_categories landmark_merges landmark_relations landmark_sightings landmark_views landmark_visits landmarks \
-    loop_closures map_gravity map_models maps models object_features objects planned_links planned_poses \
+    landmark_categories landmark_merges landmark_parts landmark_relations landmark_sightings landmark_views landmark_visits landmarks \
+    loop_closures map_completions map_gravity map_models maps models object_features objects planned_links planned_poses \
     pose_covariances pose_errors pose_operations pose_revisions pose_sources queries recording_findings \
     recordings refined_points refinements keyframe_objects category_counts recording_summary covisible_objects \
     keypoint_counts keyframe_links keyframe_quality landmark_list landmark_relations_named \
