@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from semdb.api.localizing import Localizing, read_frame
-from semdb.errors import FrameError, UsageError
+from semdb.errors import FrameError, ProvenanceError, UsageError
 from semdb.geometry import FARTHEST_POSE_M
 
 if TYPE_CHECKING:
@@ -35,13 +35,15 @@ class MapTracker:
     def __init__(
         self, maps: OpenMaps, map_name: str | None, reader: QueryReader, options: TrackerOptions | None
     ) -> None:
-        from semdb.tracking.tracker import Tracker
-
-        self._maps, self._reader = maps, reader
-        self._entry = one_map(maps, map_name)
-        self._tracker = Tracker(self._entry.localizer.cache, options)
+        self._maps, self._reader, self._options = maps, reader, options
+        self._begin(one_map(maps, map_name))
         self._looked_s, self._heads_s = -np.inf, -np.inf
         self._number = 0
+
+    def _begin(self, entry: OpenMap) -> None:
+        from semdb.tracking.tracker import Tracker
+
+        self._entry, self._tracker = entry, Tracker(entry.localizer.cache, self._options)
 
     @property
     def map(self) -> str:
@@ -117,12 +119,24 @@ class MapTracker:
             return
         self._looked_s = now
         if now - self._heads_s >= HEADS_S:
-            self._heads_s = now
-            entry = one_map(self._maps, self.map)
-            if entry is not self._entry:
-                self._entry = entry
-                self._tracker.keyframes = entry.localizer.cache
-        self._entry.localizer.refresh()
+            self._take_over(now)
+        try:
+            keyframes = self._entry.localizer.refresh()
+        except ProvenanceError:  # described anew by another encoder: what is open goes on with the old vectors
+            keyframes = 0
+        if not keyframes:  # or deleted, and another one may have its name
+            self._take_over(now)
+            self._entry.localizer.refresh()
+
+    def _take_over(self, now: float) -> None:
+        """The map as it is now. Poses in one that is not there any more say nothing of another one of that name."""
+        self._heads_s = now
+        entry = one_map(self._maps, self.map)
+        if entry.head.id != self._entry.head.id:
+            self._begin(entry)
+        elif entry is not self._entry:
+            self._entry = entry
+            self._tracker.keyframes = entry.localizer.cache
 
 
 class TrackingCameras(Localizing):

@@ -224,9 +224,9 @@ def estimate_pose(
         pairs, error, refined, seen = _refine(query, keyframes, pairs, points, agreeing, camera_from_world, options)
     except np.linalg.LinAlgError:
         return None
-    pose, covariance = refined.camera_from_world, refined.covariance
-    estimate = _estimate(query, keyframes, pairs, error, pose, covariance, first, options)
-    if estimate is None or covariance is None:
+    pose = refined.camera_from_world
+    estimate = _estimate(query, keyframes, pairs, error, pose, refined.covariance, first, options)
+    if estimate is None or estimate.covariance is None:
         return None
     keep = error < options.inlier_px
     aligned = int(np.count_nonzero(seen.found))
@@ -237,7 +237,7 @@ def estimate_pose(
         return found
     # by what this query shows, what its keyframes' recordings do, and what is usual
     measured = weighted([keyframe.pose_errors for keyframe in keyframes], estimate.per_keyframe)
-    return replace(found, recorded=recorded_errors(shrunk(refined.evident, measured), at, covariance))
+    return replace(found, recorded=recorded_errors(shrunk(refined.evident, measured), at, estimate.covariance))
 
 
 def recorded_covariance(estimate: PoseEstimate) -> FloatArray | None:

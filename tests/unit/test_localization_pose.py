@@ -14,14 +14,17 @@ from semdb.geometry.sensor import depth_noise
 from semdb.localization.bundle_kernels import depth_sigma
 from semdb.localization.matching import Evidence, MatchingOptions
 from semdb.localization.pose import (
+    _excess_variance,
     estimate_pose,
     first_pose,
     match_view,
     recorded_covariance,
 )
 from semdb.localization.pose_options import PoseOptions
+from semdb.localization.recorded_errors import MODEL
 from semdb.localization.rivals import _iterations_for, rival_pose
 from semdb.localization.views import ClassNumbers, make_keyframe_view
+from semdb.types import PoseErrors
 from tests.unit.localization_scene import CAMERA, DISTORTED, Scene
 
 NO_DEPTH = PoseOptions(use_query_depth=False)
@@ -129,6 +132,31 @@ def test_a_pose_is_the_same_where_nothing_is_asked_of_recorded_poses() -> None:
     assert usual.recorded is not None
     assert less.recorded is None
     np.testing.assert_array_equal(recorded_covariance(less), usual.covariance)
+
+
+def test_what_counts_with_recorded_poses_is_what_the_residuals_make_of_the_images() -> None:
+    scene, numbers = Scene(4, count=200), ClassNumbers()
+    keyframes = [
+        replace(
+            scene.keyframe(i, scene.pose(0.3, 8), numbers, pixel_noise=2.5, depth_noise=0.01),
+            pose_errors=PoseErrors(0.01, 0.01, 300.0, 300.0, 100),
+        )
+        for i in range(3)
+    ]
+    query = scene.query(scene.pose(0.3, 10), numbers, pixel_noise=2.5)
+    matches = [match_view(query, keyframe, NO_DEPTH.matching) for keyframe in keyframes]
+    found = estimate_pose(query, keyframes, matches, NO_DEPTH)
+    assert found is not None
+    assert found.covariance is not None
+    assert _excess_variance(found.residual_px, NO_DEPTH) > 1.3
+    whole = recorded_covariance(found)
+    assert whole is not None
+    times = np.diag(whole) / np.diag(found.covariance)
+    assert (times[:3] > MODEL.place_images).all()
+    assert (times[3:] > MODEL.turn_images).all()
+    np.testing.assert_allclose(
+        whole[3:, :3], found.covariance[3:, :3] * np.sqrt(MODEL.turn_images * MODEL.place_images), rtol=1e-6
+    )
 
 
 def test_query_depth_improves_the_position() -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from semdb.api import tracking
 from semdb.api.tracking import HEADS_S, LOOKED_S, MapTracker
+from semdb.errors import ProvenanceError
 
 
 class Maps:
@@ -16,14 +17,23 @@ class Maps:
 
     def __init__(self) -> None:
         self.heads = self.refreshed = 0
+        self.another_encoder = False
+        self.keyframes = 20
         self.entry = self.opened()
 
-    def opened(self) -> Any:
-        localizer = SimpleNamespace(cache=object(), refresh=self._refresh)
-        return SimpleNamespace(head=SimpleNamespace(name="office"), localizer=localizer)
+    def opened(self, key: int = 1) -> Any:
+        localizer = SimpleNamespace(cache=object())
+        found = SimpleNamespace(head=SimpleNamespace(id=key, name="office"), localizer=localizer)
+        localizer.refresh = lambda: self._refresh(found)
+        return found
 
-    def _refresh(self) -> None:
+    def _refresh(self, entry: Any) -> int:
         self.refreshed += 1
+        if entry is self.entry:
+            return 20
+        if self.another_encoder:
+            raise ProvenanceError("described anew by another encoder")
+        return self.keyframes
 
     def asked(self, name: str | None, coarse: str) -> list[Any]:
         self.heads += 1
@@ -46,3 +56,24 @@ def test_keyframes_are_looked_at_every_second_and_models_every_ten(monkeypatch: 
     assert maps.heads == 3
     assert tracker._entry is maps.entry
     assert tracker._tracker.keyframes is maps.entry.localizer.cache
+
+
+def test_a_map_that_is_described_anew_or_replaced_is_taken_over_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, maps = [100.0], Maps()
+    monkeypatch.setattr(tracking.time, "monotonic", lambda: now[0])
+    tracker = MapTracker(maps, None, None, None)  # type: ignore[arg-type]
+    tracker._look()
+    first = tracker._tracker
+    maps.entry, maps.another_encoder = maps.opened(), True
+    now[0] += LOOKED_S
+    tracker._look()
+    assert tracker._entry is maps.entry
+    assert tracker._tracker is first  # poses are those of the same map
+    assert first.keyframes is maps.entry.localizer.cache
+    maps.entry, maps.another_encoder, maps.keyframes = maps.opened(2), False, 0  # deleted, and another one of that name
+    now[0] += LOOKED_S
+    tracker._look()
+    assert tracker._entry is maps.entry
+    assert tracker._tracker is not first  # nothing is carried on in it
+    assert tracker._tracker.keyframes is maps.entry.localizer.cache
+    assert maps.heads == 4
