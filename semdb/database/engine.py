@@ -6,6 +6,7 @@ import os
 import socket
 from pathlib import Path
 from typing import Any
+from weakref import WeakSet
 
 from sqlalchemy import URL, Connection, Engine, create_engine, event
 from sqlalchemy.engine import ExceptionContext, make_url
@@ -21,6 +22,7 @@ CONNECT_TIMEOUT_S = 5
 READ_TIMEOUT_S = 120  # more than the 50 s that a server lets a statement wait for a lock: that answer comes first
 BUSY_TIMEOUT_MS = 30_000
 WRITE = "semdb_write"  # execution option of transactions that may be run again (`retry`): whether they write
+answered: WeakSet[Engine] = WeakSet()  # engines that have had a connection
 _HINT = "use sqlite:///FILE or mysql+pymysql://USER:PASSWORD@HOST/SCHEMA"
 # Seconds: a machine that is gone is noticed after a minute, also where a statement may take any time.
 _KEEPALIVE = (("TCP_KEEPIDLE", 30), ("TCP_KEEPINTVL", 10), ("TCP_KEEPCNT", 3))
@@ -168,6 +170,11 @@ def make_server_engine(url: URL, read_timeout_s: int | None = None) -> Engine:
 
     # Before SQLAlchemy looks at the modes, for which it would quote names.
     event.listen(engine, "connect", _configure_server, insert=True)
+
+    @event.listens_for(engine, "connect", insert=True)
+    def _greeted(_connection: Any, _record: Any) -> None:
+        answered.add(engine)  # it has let us in: a connection that is lost from here on may be made again
+
     event.listen(engine, "handle_error", _leave_node)
     _limit_waiting(engine, read_timeout_s)
     return engine

@@ -16,19 +16,17 @@ import struct
 import time
 from collections.abc import Callable
 from typing import TypeVar
-from weakref import WeakSet
 
 from sqlalchemy import Connection, Engine
 from sqlalchemy.exc import DataError, DBAPIError, IntegrityError, OperationalError, SQLAlchemyError
 
-from semdb.database.engine import WRITE, safe_url
+from semdb.database.engine import WRITE, answered, safe_url
 from semdb.database.hosts import HOSTS, is_left
 from semdb.database.sqlite_file import FileConnection
 from semdb.errors import DatabaseError, DatabaseUnavailableError, RecordingUnavailableError, UnstorableError
 
 T = TypeVar("T")
 _now = time.monotonic
-_answered: WeakSet[Engine] = WeakSet()  # engines that have had a connection
 listeners: list[Callable[[], None]] = []  # told of each transaction that is run again
 ATTEMPTS = 10
 FIRST_DELAY_S = 0.05
@@ -76,7 +74,7 @@ def _run(engine: Engine, work: Callable[[Connection], T], *, write: bool) -> T:
                 raise
             failure: DBAPIError = error
         except DBAPIError as error:
-            if not is_transient(error, answered=engine in _answered, several=HOSTS in engine.url.query):
+            if not is_transient(error, answered=engine in answered, several=HOSTS in engine.url.query):
                 raise explain(engine, error) from error
             failure = error
         except SQLAlchemyError as error:
@@ -95,7 +93,7 @@ def _run(engine: Engine, work: Callable[[Connection], T], *, write: bool) -> T:
 
 def _once(engine: Engine, work: Callable[[Connection], T], *, write: bool) -> T:
     with engine.connect().execution_options(**{WRITE: write}) as connection:
-        _answered.add(engine)
+        answered.add(engine)
         try:
             with connection.begin():
                 found = work(connection)
@@ -170,7 +168,7 @@ def explain(
     name = getattr(getattr(error, "orig", None), "sqlite_errorname", "") or ""
     advice = _of_tls(engine, code, reason, setting) or _of_sqlite(name, setting)
     if advice is None:
-        advice = _of_server(code, attempts, setting, answered=engine in _answered)
+        advice = _of_server(code, attempts, setting, answered=engine in answered)
     heals = is_busy(error) or code in _UNREACHABLE | _LOST | _NO_ROOM | RETRIED_CODES or name == "SQLITE_FULL"
     heals = heals or is_left(code, reason)
     unfit = isinstance(error, DataError) or code in _UNFIT or name in ("SQLITE_TOOBIG", "SQLITE_MISMATCH")

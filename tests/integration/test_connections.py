@@ -56,6 +56,25 @@ def test_a_server_that_accepts_and_says_nothing(monkeypatch: pytest.MonkeyPatch)
         assert time.monotonic() - began < 30  # a limit exists, however slow the machine
 
 
+def test_a_first_connection_that_is_cut_while_it_is_set_up_is_made_again(
+    server_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The server has let us in, so it is there."""
+    configure, lost = semdb.database.engine._configure_server, []
+
+    def cut_twice(connection: pymysql.Connection, record: object) -> None:
+        if len(lost) < 2:
+            lost.append(connection)
+            connection._sock.shutdown(socket.SHUT_RDWR)
+        configure(connection, record)
+
+    monkeypatch.setattr(semdb.database.engine, "_configure_server", cut_twice)
+    engine = make_engine(server_url)
+    assert retry.read(engine, lambda connection: connection.execute(text("SELECT 5")).scalar()) == 5
+    assert len(lost) == 2
+    engine.dispose()
+
+
 def test_a_wrong_password_and_a_wrong_schema(database_server: TestServer) -> None:
     for url in (
         database_server.admin.set(password="wrong-secret", database="mysql"),
