@@ -97,16 +97,16 @@ def main() -> None:
 def unmended(db: semdb.Database) -> Iterator[None]:
     """Images are taken as they are meanwhile: neither stretched nor are keyframes blurred alike."""
     localizers = [entry.localizer for entry in db._here.maps().asked(None, "index")]
-    before = [localizer.options for localizer in localizers]
+    before = [localizer.fine for localizer in localizers]
     plain = {f"semdb.{name}.with_contrast": lambda image: (image, None) for name in SHOWN}
     with contextlib.ExitStack() as stack:
         for name, function in plain.items():
             stack.enter_context(mock.patch(name, function))
         for localizer in localizers:
-            localizer.options = replace(localizer.options, blur=None)
+            localizer.fine = replace(localizer.fine, options=replace(localizer.fine.options, blur=None))
         yield
-    for localizer, options in zip(localizers, before, strict=True):
-        localizer.options = options
+    for localizer, fine in zip(localizers, before, strict=True):
+        localizer.fine = fine
 
 
 def measure(

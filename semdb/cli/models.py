@@ -35,6 +35,7 @@ SPECS = (
     ("encoder", "onnx:FILE", True, "a CNN from image [B,3,224,224] (RGB, 0..1) to embedding"),
     ("encoder", "torchvision:NAME|PATH", True, "a ResNet in torch: a published one, or a checkpoint"),
     ("features", "surf", False, "SURF, 64 dimensions"),
+    ("features", "surf:weak", False, "the same, with weak keypoints of images that give few"),
     ("features", "sift", False, "SIFT of OpenCV"),
     ("features", "orb", False, "ORB of OpenCV, binary"),
     ("features", "onnx:FILE", True, "a network from image [1,3,H,W] to keypoints, scores, descriptors"),

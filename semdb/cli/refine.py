@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -25,7 +24,7 @@ def command(
         typer.Option("--up", metavar="X,Y,Z", help="Which way is up in the map, or `estimate`; kept from then on."),
     ] = None,
     frames: Annotated[
-        list[Path] | None,
+        list[str] | None,
         typer.Option(
             "--frames",
             metavar="RECORDING",
@@ -54,7 +53,7 @@ def command(
         if step or up:
             raise UsageError("--frames does nothing else: leave out --step and --up")
         options = {"map": map_name, "name": name, "camera": camera}
-        _add_frames(overrides, [str(path) for path in frames], options, json)
+        _add_frames(overrides, frames, options, json)
         return
     given = [option for option, value in (("--name", name), ("--camera", camera)) if value is not None]
     if given:

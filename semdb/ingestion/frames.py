@@ -154,7 +154,7 @@ def _check_plan(store: Store, info: MapInfo, recording: Recording, entries: Mapp
         raise RecordingError(
             f"{recording.whereabouts}: its camera, its depth scale, or names, times or poses of keyframes are not "
             f"those that the map {info.name!r} was ingested with: this is another recording, or is read otherwise "
-            "(--camera is as for ingest, other options of it are given with a URL or to db.add_frames)"
+            "(--camera is as for ingest; its other options are taken by db.add_frames of Python alone, as reading=)"
         )
 
 

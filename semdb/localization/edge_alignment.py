@@ -74,17 +74,16 @@ def search_edges(query: ImageEdges, starts: Sequence[FloatArray], near: Near, op
     """Poses at which the query's edges lie well on those of keyframes, from any of `starts` ``[4, 4]``, best first.
 
     No two are the same; at most `finished` of the options. One on which far fewer edges lie than on the best after
-    coarse rounds is as these left it.
+    coarse rounds stays where these left it, and is measured as the others are.
     """
     coarse = _distinct([fit_edges(query, near(start), start, options.coarse) for start in starts])
     fine = []
     for found in coarse[: options.finished]:
-        if found.hit < coarse[0].hit - options.far_less:
-            fine.append(found)
-            continue
-        fit = fit_edges(query, near(found.world_from_camera), found.world_from_camera, options.fine)
-        if fit is not None:
-            fine.append(fit)
+        pose, far = found.world_from_camera, found.hit < coarse[0].hit - options.far_less
+        if far:
+            fine.append(measure_edges(query, near(pose), pose, options.fine[-1]))
+        else:
+            fine.append(fit_edges(query, near(pose), pose, options.fine))
     return _distinct(fine)
 
 

@@ -91,6 +91,7 @@ class Laying:
         """A sure pose for which few keypoints vouch, with whether the query looks as keyframes predict from there."""
         if description.grey is None or not laid.is_sure or laid.support >= options.few_support:
             return laid
+        # stretched, where it is: of less light than keyframes, whose values are not to end where those of the image do
         query = small_view(description.camera, description.grey)
 
         def look(pose: FloatArray) -> Windows:
@@ -119,7 +120,7 @@ def with_laid(
     evidence: Evidence | None,
 ) -> tuple[Judgement, Evidence | None]:
     """Verdict and evidence after a query was laid on the map; the pose with them."""
-    before, overrule = search.estimate, False
+    before, overrule, one = search.estimate, False, options.tolerance(search.accept)
     search.laid.append(laid)
     if laid.is_sure:
         found = estimate_with(laid, search.query, search.keyframes, search.matches, options, search.pose)
@@ -129,8 +130,10 @@ def with_laid(
         anew = evidence_of(search, found, 0 if rival is None else rival.inliers)
         overrule = may_overrule(convinced, anew, laid, options)
         if search.seen is not None:  # what is predicted decides between places
-            overrule = is_one(laid.world_from_camera, search.seen, options.tolerance(search.accept))
+            overrule = is_one(laid.world_from_camera, search.seen, one)
         if overrule:
+            if before is None or not is_one(found.world_from_camera, before.world_from_camera, one):
+                search.alike = None  # that was of another pose
             search.estimate, evidence = found, anew
             search.others.clear()
     after = judge_with(judgement, before, laid, options, overrule, search.accept)

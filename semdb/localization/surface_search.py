@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from semdb.localization.surface_alignment import (
     PlacedSurfaces,
@@ -23,17 +24,18 @@ def search_surfaces(
 ) -> list[SurfaceFit]:
     """Poses at which `query` lies well on surfaces of keyframes, from any of `starts` ``[4, 4]``, best score first.
 
-    No two are the same; at most `finished` of the options. What lies far worse than the best after coarse rounds is as
-    these left it: no fine ones would bring it near.
+    No two are the same; at most `finished` of the options. What lies far worse than the best after coarse rounds stays
+    where these left it, since no fine ones would bring it near, and is measured as the others are.
     """
     first, *others = ((one,) for one in options.coarse)
     fits = [fit_surfaces(query, near(start), start, first, options) for start in starts]
     for rounds in others:
         fits = [_from(query, fit, near, rounds, options) for fit in _best(fits)[: options.followed]]
     coarse, fine = _best(fits), list[SurfaceFit | None]()
+    as_it_lies = (replace(options.fine[-1], steps=0),)
     for fit in coarse[: options.finished]:
         far = fit.score < coarse[0].score - options.far_less
-        fine.append(fit if far else _from(query, fit, near, options.fine, options))
+        fine.append(_from(query, fit, near, as_it_lies if far else options.fine, options))
     return _best(fine)
 
 

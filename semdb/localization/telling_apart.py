@@ -14,10 +14,10 @@ from semdb.localization.pose import first_pose_at
 from semdb.localization.predicted_view import SmallView
 from semdb.localization.search import Search, evidence_of
 from semdb.localization.verdict import Judgement, judge
+from semdb.localization.view_search import is_same
 from semdb.localization.view_step import (
     Standing,
     is_like,
-    is_same,
     is_weak,
     judge_seen,
     view_numbers,
@@ -50,7 +50,6 @@ def tell_apart(
     standing = None if query is None else _standing(fine, viewing, search, query, description)
     if query is None or standing is None:
         return judgement, evidence
-    search.view_numbers = view_numbers(standing)
     pose, own = standing.best.world_from_camera, False
     if search.estimate is not None:
         own = is_same(search.estimate.world_from_camera, pose, options.same)
@@ -60,9 +59,14 @@ def tell_apart(
         anew, laid = _found_at(fine, viewing, search, query, description, own)
         if anew is not None:
             own, (judgement, evidence) = True, anew
+        elif own and search.estimate is not None:  # what is answered is not the pose that is sure, but one near it
+            standing = replace(standing, best=viewing.see(query, search.estimate.world_from_camera))
+    search.view_numbers = view_numbers(standing)
     after = judge_seen(judgement, evidence, standing, own, options, bounds, laid is not None)
     if after.verdict is not judgement.verdict and after.verdict is Verdict.AMBIGUOUS and search.estimate:
         _name_others(search, standing.against(search.estimate.world_from_camera, options))
+    elif after is not judgement and after.verdict is Verdict.LOCALIZED:
+        search.others.clear()  # they look less like the image
     return after, evidence
 
 
@@ -86,7 +90,7 @@ def _found_at(
 ) -> tuple[Judged | None, LaidPose | None]:
     """What keypoints say about the pose that is sure (`search.seen`), which the search then has, and edges laid there.
 
-    None, and the search as it was, where neither finds any there, or it does not look like the query. `own` is whether
+    None, and the pose as it was, where neither finds any there, or it does not look like the query. `own` is whether
     it is the pose that they had found.
     """
     pose, before, options = search.seen, (search.first, search.estimate), viewing.options

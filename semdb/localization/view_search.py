@@ -77,7 +77,7 @@ def _distinct(
     for one in sorted(found, key=lambda one: -one[0]):
         if len(kept) == count:
             break
-        if not any(_is_same(one[1], other[1], same) for other in kept):
+        if not any(is_same(one[1], other[1], same) for other in kept):
             kept.append(one)
     return kept
 
@@ -153,6 +153,7 @@ def _directions(metres: float, radians: float) -> FloatArray:
     return found
 
 
-def _is_same(pose: FloatArray, other: FloatArray, tolerance: Tolerance) -> bool:
+def is_same(pose: FloatArray, other: FloatArray, tolerance: Tolerance) -> bool:
+    """Whether two poses ``[4, 4]`` are nearer to each other than `tolerance`."""
     metres, degrees = pose_error(pose, other)
     return metres < tolerance.metres and degrees < tolerance.degrees

@@ -7,12 +7,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from semdb.geometry import pose_error
 from semdb.localization.confidence import Evidence
 from semdb.localization.edge_alignment import EdgeOptions
 from semdb.localization.predicted_view import ALIKE, Windows
 from semdb.localization.verdict import Judgement, VerdictOptions, is_precise
-from semdb.localization.view_search import SearchOptions
+from semdb.localization.view_search import SearchOptions, is_same
 from semdb.types import FloatArray, Tolerance, Verdict
 
 
@@ -110,11 +109,6 @@ def stand(found: Sequence[Seen], options: ViewOptions) -> Standing:
     best = max(enough, key=lambda seen: seen.alike)
     others = [seen for seen in found if not is_same(seen.world_from_camera, best.world_from_camera, options.same)]
     return Standing(best, tuple(seen for seen in others if not beats(best, seen, options)))
-
-
-def is_same(pose: FloatArray, other: FloatArray, tolerance: Tolerance) -> bool:
-    metres, degrees = pose_error(pose, other)
-    return metres < tolerance.metres and degrees < tolerance.degrees
 
 
 def is_weak(evidence: Evidence, options: ViewOptions) -> bool:

@@ -16,8 +16,8 @@ from semdb.localization.pose import robust_pnp
 from semdb.localization.predicted_view import PlacedView, SmallView, compare_view, small_view
 from semdb.localization.search import Search
 from semdb.localization.verdict import VerdictOptions
-from semdb.localization.view_search import search_views
-from semdb.localization.view_step import Seen, Standing, ViewOptions, is_same, stand
+from semdb.localization.view_search import is_same, search_views
+from semdb.localization.view_step import Seen, Standing, ViewOptions, stand
 from semdb.types import Description, FloatArray
 
 LEAST_PAIRS = 8  # of a keyframe alone, for a pose of its own

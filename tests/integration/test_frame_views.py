@@ -246,6 +246,8 @@ def test_the_command(room: Path, url: str, tmp_path: Path) -> None:
     run = CliRunner().invoke(app, ["refine", "--frames", str(room), "--database-url", f"sqlite:///{copy}"])
     assert run.exit_code == 0, run.output
     assert f"frames beside {KEYFRAMES} keyframes" in run.output
+    again = ["refine", "--frames", f"file://{room}", "--database-url", f"sqlite:///{copy}"]
+    assert CliRunner().invoke(app, again, env={"SEMDB_CACHE_DIR": str(tmp_path / "cache")}).output == run.output
     for words, said in ((["--name", "other"], "'other'"), (["--camera", "200,200,159.5,119.5"], "its camera")):
         asked = ["refine", "--frames", str(room), "--map", "room", "--database-url", f"sqlite:///{copy}", *words]
         run = CliRunner().invoke(app, asked)

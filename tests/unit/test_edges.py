@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from semdb.geometry import pose_error, so3_exp
 from semdb.localization.confidence import sigmas
-from semdb.localization.edge_alignment import EdgeOptions, fit_edges, measure_edges, search_edges
+from semdb.localization.edge_alignment import EdgeOptions, EdgeRound, fit_edges, measure_edges, search_edges
 from semdb.localization.edge_step import covariance_of
 from semdb.localization.edges import PlacedEdges, SpaceEdges, image_edges, space_edges
 from semdb.types import Camera, Float32Array, FloatArray, ImageArray
@@ -73,6 +75,18 @@ def test_a_corner_gives_the_pose_to_millimetres() -> None:
     assert found[0].hit > 0.9
     assert found[0].explained > 0.9
     assert sigmas(covariance_of(found[0]))[0] < 0.15
+
+
+def test_what_lies_far_worse_is_not_finished_and_yet_measured_as_what_is() -> None:
+    keyframes = [placed(pose((0.2 * k, 0.0, 0.0), (0.0, 4.0 * k, 0.0))) for k in range(2)]
+    query, aside = image_edges(CAMERA, look(np.eye(4))[1]), pose((0.1, 0.0, 0.0), (0.0, 0.0, 0.0))
+    options = replace(OPTIONS, coarse=(EdgeRound(20, 0.8, 4, 0, 5),), far_less=0.01)
+    best, far = search_edges(query, [np.eye(4), aside], lambda _: keyframes, options)
+    np.testing.assert_array_equal(far.world_from_camera, aside)
+    as_others = measure_edges(query, keyframes, aside, OPTIONS.fine[-1])
+    assert as_others is not None
+    assert (far.seen, far.hit) == (as_others.seen, as_others.hit)  # of every point
+    assert best.hit > far.hit
 
 
 def test_edges_that_are_bright_on_the_other_side_are_others() -> None:

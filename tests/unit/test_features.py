@@ -149,7 +149,7 @@ def test_what_is_no_grey_image_is_refused(spec: str) -> None:
 
 
 def test_unknown_spec_names_the_known_ones() -> None:
-    with pytest.raises(UsageError, match="surf, sift, orb"):
+    with pytest.raises(UsageError, match="surf, sift, orb, surf:weak and onnx:FILE"):
         load_features("brisk", settings())
 
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from semdb.geometry import pose_error, so3_exp
+from semdb.localization.alike import Alike
+from semdb.localization.coarse import Proposal
 from semdb.localization.confidence import Evidence, sigmas
 from semdb.localization.edge_alignment import EdgeFit
 from semdb.localization.edge_step import EdgeVerdictOptions
@@ -21,12 +25,17 @@ from semdb.localization.laid_pose import (
     shared_doubts,
     with_view,
 )
+from semdb.localization.laying import with_laid
+from semdb.localization.localizer_options import LocalizerOptions
 from semdb.localization.pairs import join_pairs
-from semdb.localization.pose import PoseEstimate
+from semdb.localization.pose import PoseEstimate, estimate_pose, match_views
 from semdb.localization.predicted_view import Windows
+from semdb.localization.search import Search, numbers_of
 from semdb.localization.surface_step import SurfaceVerdictOptions, with_edges
 from semdb.localization.verdict import Judgement
+from semdb.localization.views import ClassNumbers
 from semdb.types import FloatArray, Verdict
+from tests.unit.localization_scene import Scene
 
 
 def pose(shift: tuple[float, float, float], turn_deg: tuple[float, float, float]) -> FloatArray:
@@ -148,3 +157,21 @@ def test_a_laid_pose_is_in_doubt_where_the_map_predicts_another_view(alike: floa
     if not is_sure:
         assert found.doubts == ("where the edges fit only 50% of the image look as the map predicts",)
         assert not found.fits_well  # nor does it stand against keypoints elsewhere
+
+
+@pytest.mark.parametrize(("aside", "kept"), [(0.01, True), (5.0, False)])
+def test_what_looked_alike_at_another_pose_is_no_evidence_of_a_laid_one(aside: float, kept: bool) -> None:
+    scene, numbers, options = Scene(3, 300), ClassNumbers(), LocalizerOptions()
+    query, keyframes = scene.query(np.eye(4), numbers), [scene.keyframe(1, scene.pose(0.1, 2), numbers)]
+    search = Search(query, 1, options.pose, keyframes=list(keyframes), proposals=[Proposal(1, 1.0, 1.0)])
+    search.matches = match_views(query, keyframes, options.pose)
+    found = estimate_pose(query, keyframes, search.matches, options.pose)
+    assert found is not None
+    search.estimate = replace(found, world_from_camera=pose((aside, 0, 0), (0, 0, 0)))
+    search.alike = Alike(0.4, 0.3)
+    sure = replace(laid(()), covariance=np.eye(6) * 1e-6)
+    doubt = Judgement(Verdict.AMBIGUOUS, 0.3, "")
+    judgement, anew = with_laid(search, sure, EdgeVerdictOptions(), False, doubt, None)
+    assert judgement.verdict is Verdict.LOCALIZED
+    assert search.estimate.world_from_camera[0, 3] < 0.01
+    assert ("alike" in numbers_of(search, anew)) is kept

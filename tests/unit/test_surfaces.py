@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from semdb.geometry import pose_error, so3_exp
 from semdb.localization.confidence import sigmas
-from semdb.localization.surface_alignment import PlacedSurfaces, SurfaceFit, SurfaceOptions, distinct, place
+from semdb.localization.surface_alignment import (
+    PlacedSurfaces,
+    Round,
+    SurfaceFit,
+    SurfaceOptions,
+    distinct,
+    fit_surfaces,
+    place,
+)
 from semdb.localization.surface_search import search_surfaces
 from semdb.localization.surface_step import covariance_of
 from semdb.localization.surfaces import surfaces_of
@@ -106,6 +116,25 @@ def test_without_overlap_there_is_no_pose() -> None:
     behind = pose((0.0, 0.0, 0.0), (0.0, 180.0, 0.0))
     assert search_surfaces(query, [behind], lambda _: [placed(np.eye(4))], OPTIONS) == []
     assert surfaces_of(CAMERA, np.full((240, 320), np.nan, np.float32), np.zeros((240, 320), np.uint8)) is None
+
+
+def test_what_lies_far_worse_is_not_finished_and_yet_measured_as_what_is() -> None:
+    keyframes = [placed(pose((0.2 * k, 0.0, 0.0), (0.0, 4.0 * k, 0.0)), paint=30.0) for k in range(2)]
+    query = surfaces_of(CAMERA, *look(np.eye(4), paint=30.0))
+    assert query is not None
+    still = (Round(1, 0.30, 0.02, 0, 5), Round(1, 0.15, 0.01, 0, 5))
+    aside = pose((0.0, 0.0, 0.1), (0.0, 0.0, 0.0))
+    best, far = search_surfaces(
+        query, [np.eye(4), aside], lambda _: keyframes, replace(OPTIONS, coarse=still, far_less=0.01)
+    )
+    np.testing.assert_array_equal(far.world_from_camera, aside)
+    as_others = fit_surfaces(query, keyframes, aside, (replace(OPTIONS.fine[-1], steps=0),), OPTIONS)
+    roughly = fit_surfaces(query, keyframes, aside, still, OPTIONS)
+    assert as_others is not None
+    assert roughly is not None
+    assert (far.seen, far.near, far.through) == (as_others.seen, as_others.near, as_others.through)
+    assert far.through > roughly.through + 0.1  # whose bounds are wider
+    assert best.near > 0.98
 
 
 def fit_at(shift: float, near: float = 0.9, through: float = 0.0) -> SurfaceFit:

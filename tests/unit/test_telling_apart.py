@@ -46,6 +46,7 @@ class Told(Viewing):
 
     told: Standing | None = None
     lies: LaidPose | None = None
+    alike: float = 1.0
 
     def laid(self, *_: object) -> LaidPose | None:
         return self.lies
@@ -57,7 +58,7 @@ class Told(Viewing):
         return self.told
 
     def see(self, query: SmallView, pose: FloatArray) -> Seen:
-        return seen(pose)
+        return seen(pose, self.alike)
 
 
 class NoNeighbours:
@@ -69,9 +70,19 @@ class NoNeighbours:
 
 
 def tell(
-    points: int, standing: Standing, accept: Tolerance | None = None, lies: LaidPose | None = None
+    points: int,
+    standing: Standing,
+    accept: Tolerance | None = None,
+    lies: LaidPose | None = None,
+    aside: float = 5.0,
+    alike: float = 1.0,
+    before: Judgement = WEAK,
+    rivals: Sequence[ConsistentPose] = (),
 ) -> tuple[Search, Judgement]:
-    """A query at the origin, whose keypoints were taken for a pose 5 m aside by a weak answer."""
+    """A query at the origin, whose keypoints were taken for a pose 5 m aside by a weak answer.
+
+    `alike` is how the query looks like what is predicted at any other pose than those that stand.
+    """
     scene, numbers = Scene(3, points), ClassNumbers()
     query, keyframes = scene.query(np.eye(4), numbers), [scene.keyframe(1, scene.pose(0.1, 2), numbers)]
     options = LocalizerOptions(neighbours=0)
@@ -79,11 +90,12 @@ def tell(
     search.matches = match_views(query, keyframes, options.pose)
     found = estimate_pose(query, keyframes, search.matches, options.pose)
     assert found is not None
-    search.estimate = replace(found, world_from_camera=shifted(5.0))
+    search.estimate = replace(found, world_from_camera=shifted(aside))
+    search.others += rivals
     evidence = replace(evidence_of(search, found, 0), agreement=0.3, first_of_best=10, likeness=0.5)
     fine = FineStep(cast(Any, NoNeighbours()), (), options)
-    viewing = Told(cast(Any, None), ViewOptions(), standing, lies)
-    judgement, _ = tell_apart(fine, viewing, search, cast(Any, None), WEAK, evidence)
+    viewing = Told(cast(Any, None), ViewOptions(), standing, lies, alike)
+    judgement, _ = tell_apart(fine, viewing, search, cast(Any, None), before, evidence)
     return search, judgement
 
 
@@ -112,6 +124,21 @@ def test_edges_hold_a_sure_pose_of_which_keypoints_are_few() -> None:
     assert np.abs(search.estimate.world_from_camera[:3, 3] - [0.001, 0, 0]).max() < 0.005
     assert found.verdict is Verdict.LOCALIZED
     assert search.seen is search.estimate.world_from_camera
+
+
+@pytest.mark.parametrize(("alike", "verdict"), [(0.7, Verdict.AMBIGUOUS), (0.9, Verdict.LOCALIZED)])
+def test_a_sure_pose_vouches_for_none_beside_it_that_does_not_look_so(alike: float, verdict: Verdict) -> None:
+    """So much looks as predicted where keypoints agree, about the sure pose and 0.2 m aside."""
+    doubt = Judgement(Verdict.AMBIGUOUS, 0.4, "a pose elsewhere has 18 against 20 inliers")
+    rivals = [ConsistentPose(shifted(7.0), 18)]
+    search, found = tell(300, Standing(seen(np.eye(4)), ()), aside=0.2, alike=alike, before=doubt, rivals=rivals)
+    assert found.verdict is verdict
+    if verdict is Verdict.AMBIGUOUS:
+        assert found is doubt
+        assert search.view_numbers["view_alike"] == pytest.approx(0.7, abs=0.01)
+        assert len(search.others) == 1
+    else:
+        assert search.others == []
 
 
 def test_a_pose_that_looks_as_much_like_the_image_is_named() -> None:

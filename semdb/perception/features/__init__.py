@@ -33,4 +33,4 @@ def load_features(spec: str, settings: Settings) -> FeatureExtractor:
         from semdb.perception.features.onnx import OnnxFeatures
 
         return OnnxFeatures(spec, settings)
-    raise UsageError(f"no local feature {spec!r}: SEMDB_FEATURES knows {', '.join(KNOWN)} and onnx:FILE")
+    raise UsageError(f"no local feature {spec!r}: SEMDB_FEATURES knows {', '.join(KNOWN)}, {WEAK} and onnx:FILE")
