@@ -1,8 +1,8 @@
 """How long `semdb find` takes in a database of many landmarks.
 
-``python -m bench.landmarks.finding [--landmarks N] [--url URL]``. Made-up landmarks of 80 classes in maps of 1000, each
-with ten relations, and one in five may be of another class; URL is that of an empty database with the schema (default:
-a temporary SQLite file).
+``python -m bench.landmarks.finding [--landmarks N] [--per-map N] [--url URL]``. Made-up landmarks of 80 classes in maps
+of 1000, each with ten relations, and one in five may be of another class; URL is that of an empty database with the
+schema (default: a temporary SQLite file).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from sqlalchemy import insert, select
 
 from semdb.api.finding import find
-from semdb.database import landmark_tables, tables
+from semdb.database import landmark_tables
 from semdb.database.ids import SharedIds
 from semdb.database.store import Store, open_store
 
@@ -40,7 +40,7 @@ def fill(store: Store, number: int, per_map: int = 1000) -> None:
         map_id = store.ensure_map(f"map {k}")
         count = min(per_map, number - made)
         places = rng.uniform(-20, 20, (count, 3))
-        zeros = dict.fromkeys(tables.COVARIANCE_COLUMNS, 0.0)
+        zeros = dict.fromkeys(landmark_tables.COVARIANCE_COLUMNS, 0.0)
         classes = [keys[int(rng.integers(80))] for _ in range(count)]
         rows = [
             {
@@ -99,6 +99,7 @@ def measure(store: Store, questions: int = 200) -> list[tuple[float, float]]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--landmarks", type=int, default=100_000)
+    parser.add_argument("--per-map", type=int, default=1000)
     parser.add_argument("--url")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
@@ -107,7 +108,7 @@ def main() -> None:
             with store.engine.connect() as connection:
                 empty = connection.execute(select(landmark_tables.landmarks.c.id).limit(1)).first() is None
             if empty:
-                fill(store, given.landmarks)
+                fill(store, given.landmarks, given.per_map)
             measure(store, 8)
             taken = measure(store)
     asked = np.arange(len(taken)) % 8

@@ -34,7 +34,7 @@ from bench.landmarks.rooms import (
 )
 from bench.landmarks.scores import SEEN, as_landmark, main_label
 from semdb.api.finding import find
-from semdb.database import landmark_tables, tables
+from semdb.database import landmark_tables
 from semdb.database.ids import SharedIds
 from semdb.database.landmark_search import NEAR, ON
 from semdb.database.store import Store, open_store
@@ -144,7 +144,11 @@ def write(
                 {
                     **{"id": key, "map_id": map_id, "category_id": ids[names[one.category]], "evidence": "{}"},
                     **dict(zip("xyz", map(float, one.box.centre), strict=True)),
-                    **{"probability": one.probability, **dict.fromkeys(tables.COVARIANCE_COLUMNS, 0.0), **sides},
+                    **{
+                        "probability": one.probability,
+                        **dict.fromkeys(landmark_tables.COVARIANCE_COLUMNS, 0.0),
+                        **sides,
+                    },
                     **{"yaw": float(np.arctan2(across[1], across[0])), "sightings": len(one.members)},
                     **{"keyframes": one.keyframes, "missed": one.missed, "seen_through": one.seen_through},
                     "state": str(one.state),

@@ -62,8 +62,9 @@ def replace_completions(
     """Write the completed classes of a map in place of those that are there, within a transaction of its refinement.
 
     Each of `completed` is what a keyframe shows of a class at least (`category_ids` has the ids by name); a class that
-    no keyframe of the map has is passed over. Where nothing is added there are no rows. The log of changes has the
-    keyframes of which something else is known than before, so that indexes look again.
+    no keyframe of the map has is passed over. Where nothing is added there are no rows, nor where the map is not what
+    it was when it was read. The log of changes has the keyframes that are completed, or were, so that indexes look
+    again.
     """
     f, c = refinements.c, map_completions.c
     state = connection.execute(select(f.map_state).where(f.map_id == map_id, f.kind == STEP)).scalar()
@@ -71,6 +72,8 @@ def replace_completions(
     seen = _shown(connection, keyframe_categories, map_id)
     before = seen if before_state is None else _shown(connection, completed_categories, map_id)
     after = {key: dict(found) for key, found in seen.items()}
+    if state != map_state_of(connection, map_id):
+        completed = ()  # the map may come to be so again, with keyframes of which these say nothing
     added = _complete(after, [(one.keyframe_id, category_ids[one.category], one.upper, one.lower) for one in completed])
     connection.execute(delete(map_completions).where(c.map_id == map_id))
     connection.execute(delete(completed_categories).where(completed_categories.c.map_id == map_id))
@@ -79,7 +82,9 @@ def replace_completions(
         rows = [row for key in sorted(after) for row in _rows(map_id, key, after[key])]
         for start in range(0, len(rows), CHUNK):
             connection.execute(insert(completed_categories), rows[start : start + CHUNK])
-    changed = added if before_state != state else {key for key in after if after[key] != before.get(key)}
+    changed = set(added)
+    if before_state == state:  # who opened the map while this step was forgotten knows of none
+        changed |= {key for key, found in before.items() if key in seen and found != seen[key]}
     kind = ChangeKind.REDESCRIBED.value
     entries = [{"map_id": map_id, "keyframe_id": key, "kind": kind} for key in sorted(changed)]
     for start in range(0, len(entries), CHUNK):

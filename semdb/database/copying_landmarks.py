@@ -42,6 +42,15 @@ def copy_landmarks(
     }
     recordings = _recordings(source, map_id, target, target_map_id)
     completed = _completed(source, map_id, keyframes)
+    # here and not below, which may be run again
+    for row in hanging[landmark_tables.landmark_relations]:
+        row["other_category_id"] = categories.get(int(row["other_category_id"] or 0))
+    for row in (*hanging[landmark_tables.landmark_categories], *completed.get(tables.completed_categories, ())):
+        row["category_id"] = categories[int(row["category_id"])]
+    for row in (row for found in (hanging[landmark_tables.landmark_categories], *completed.values()) for row in found):
+        row["map_id"] = target_map_id
+        if "keyframe_id" in row:
+            row["keyframe_id"] = keyframes[int(row["keyframe_id"])]
 
     def work(connection: Connection) -> None:
         ids: dict[int, int] = {}
@@ -51,18 +60,9 @@ def copy_landmarks(
             for name in ("first_keyframe_id", "last_keyframe_id"):
                 values[name] = None if row[name] is None else keyframes.get(int(row[name]))
             ids[int(row["id"])] = new_id(connection, landmark_tables.landmarks, values)
-        for row in hanging[landmark_tables.landmark_relations]:
-            row["other_category_id"] = categories.get(int(row["other_category_id"] or 0))
-        for row in hanging[landmark_tables.landmark_categories]:
-            row |= {"map_id": target_map_id, "category_id": categories[int(row["category_id"])]}
         for table, found in hanging.items():
             _insert(connection, table, found, ids, objects, recordings)
         for table, found in completed.items():
-            for row in found:
-                row["map_id"] = target_map_id
-                if "keyframe_id" in row:
-                    row["keyframe_id"] = keyframes[int(row["keyframe_id"])]
-                    row["category_id"] = categories[int(row["category_id"])]
             for start in range(0, len(found), 500):
                 connection.execute(insert(table), found[start : start + 500])
 

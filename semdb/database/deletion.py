@@ -14,7 +14,8 @@ from typing import Any
 from sqlalchemy import Column, Connection, Engine, delete, insert, literal, select, update
 
 from semdb.database import retry
-from semdb.database.landmark_tables import landmark_merges, landmark_parts, landmarks
+from semdb.database.landmark_parts import forget_parts
+from semdb.database.landmark_tables import landmark_merges, landmarks
 from semdb.database.records import ChangeKind, Deleted, ItemState, RecordingState
 from semdb.database.tables import (
     cameras,
@@ -118,7 +119,7 @@ def delete_map(engine: Engine, map_id: int, progress: Progress | None = None) ->
     _delete_rows(engine, keyframe_changes.c.map_id, map_id, keyframe_changes.c.id)
     for table, rank in ((landmarks, landmarks.c.id), (landmark_merges, landmark_merges.c.landmark_id)):
         _delete_rows(engine, table.c.map_id, map_id, rank)
-    _delete_rows(engine, landmark_parts.c.map_id, map_id, landmark_parts.c.kind)
+    forget_parts(engine, map_id)
     _delete_rows(engine, completed_categories.c.map_id, map_id, completed_categories.c.category_id)
     _delete_rows(engine, queries.c.map_id, map_id, queries.c.created_at)
     retry.write(engine, lambda c: c.execute(delete(maps).where(maps.c.id == map_id)))

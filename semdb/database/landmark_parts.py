@@ -72,7 +72,7 @@ def unpack(kind: str, name: str, data: object) -> dict[str, npt.NDArray[Any]] | 
     if not isinstance(data, bytes) or len(data) < _HEAD.size:
         return None
     magic, checksum, length, described = _HEAD.unpack_from(data)
-    if magic != MAGIC or not described <= length <= MOST_BYTES:
+    if magic != MAGIC or not 0 < described <= length <= MOST_BYTES:
         return None
     reader = isal_zlib.decompressobj()
     try:
@@ -100,12 +100,14 @@ class LandmarkParts:
     """
 
     LARGE = ("grid",)
+    FIRST = ("lift", *LARGE)  # of a keyframe, of no use one without the other: stored before the others
 
     def __init__(self, engine: Engine, map_id: int, revision: int, *, empty: bool = False) -> None:
         """`revision` of the computation: what another one made is nothing. `empty`: nothing that is stored is read."""
         self._revision = revision
         self._engine, self._map_id, self._empty = engine, map_id, empty
         self._known: dict[str, dict[str, Arrays]] = {}
+        self._large: dict[str, set[str]] = {}  # names of what is stored, by kind
         self._used: set[tuple[str, str]] = set()
         self._new: dict[tuple[str, str], bytes] = {}
         self._waiting = 0  # bytes of large ones that are not stored
@@ -128,6 +130,16 @@ class LandmarkParts:
         query = select(checked.up_to(c.data, MOST_BYTES)).where(self._mine, c.kind == kind, c.name == name)
         return unpack(kind, name, retry.read(self._engine, lambda connection: connection.execute(query).scalar()))
 
+    def has(self, kind: str, name: str) -> bool:
+        """Whether a large one is stored under a name; it is not read."""
+        name, c = self._named(name), landmark_parts.c
+        with self._lock:
+            if kind not in self._large and not self._empty:
+                query = select(c.name).where(self._mine, c.kind == kind)
+                rows = retry.read(self._engine, functools.partial(_rows, query=query))
+                self._large[kind] = {str(row[0]) for row in rows}
+            return name in self._large.get(kind, ())
+
     def keep(self, kind: str, name: str) -> None:
         """What is stored under a name stays, whether or not it is asked for."""
         name = self._named(name)
@@ -135,17 +147,17 @@ class LandmarkParts:
             self._used.add((kind, name))
 
     def put(self, kind: str, name: str, arrays: Arrays) -> None:
-        """Remembers arrays; they are stored by `save`, large ones before."""
+        """Remembers arrays; they are stored by `save`, large ones, and what belongs to them, before."""
         name = self._named(name)
         data = pack(kind, name, arrays)
         with self._lock:
             self._used.add((kind, name))
             self._new[kind, name] = data
             self._waiting += len(data) if kind in self.LARGE else 0
-            large = {key: self._new.pop(key) for key in list(self._new) if key[0] in self.LARGE and self._is_full}
-            self._waiting = 0 if large else self._waiting
-        if large:
-            self._write(large)
+            first = {key: self._new.pop(key) for key in list(self._new) if key[0] in self.FIRST and self._is_full}
+            self._waiting = 0 if first else self._waiting
+        if first:
+            self._write(first)
 
     def save(self) -> None:
         """Stores what is new, as far as there is room for it, and deletes what this computation did not ask for."""

@@ -182,17 +182,21 @@ def _rather_something_else(wanted: _Shape) -> Subquery:
 def _relation(names: str, kinds: Sequence[str], *, perhaps: bool) -> ColumnElement[Any]:
     """The highest score of a relation of the landmark of the query around to any of the classes; null without any.
 
-    With `perhaps`, where it has none, one to what may be of them counts as much less as it is less likely. Correlated,
-    so not through a table of its own.
+    With `perhaps`, where it has none, one to what may be of them counts as much less as it is less likely. How likely
+    is asked for each relation of the landmark, not the other way round: of a class there may be many in a map.
     """
     r, c = landmark_relations.c, landmark_categories.c
     sure = _related(names, kinds).with_only_columns(func.max(r.score)).correlate(landmarks).scalar_subquery()
     if not perhaps:
         return sure
+    likely = (
+        select(func.max(c.probability))
+        .where(c.category_id.in_(_ids_of(names)), c.map_id == landmarks.c.map_id, c.landmark_id == r.other_landmark_id)
+        .correlate(landmarks, landmark_relations)
+        .scalar_subquery()
+    )
     possible = (
-        select(func.max(r.score * c.probability))
-        .select_from(landmark_categories.join(landmark_relations, r.other_landmark_id == c.landmark_id))
-        .where(c.category_id.in_(_ids_of(names)), c.map_id == landmarks.c.map_id)
+        select(func.max(r.score * likely))
         .where(r.landmark_id == landmarks.c.id, r.kind.in_(kinds))
         .correlate(landmarks)
         .scalar_subquery()

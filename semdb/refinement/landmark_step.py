@@ -69,7 +69,7 @@ class LandmarkStep:
         from semdb.landmarks.build import SeenKeyframe, find_landmarks
         from semdb.landmarks.lift import SeenObject, lift_keyframe
         from semdb.landmarks.memo import name_of
-        from semdb.landmarks.remembered_lift import LIFT, lift_arrays, lifted_from
+        from semdb.landmarks.remembered_lift import GRID, LIFT, lift_arrays, lifted_from
         from semdb.threads import cores, each
 
         gravity = landmark_rows.load_gravity(store.engine, map_id)
@@ -130,7 +130,7 @@ class LandmarkStep:
             return SeenKeyframe(lifted, category, np.array(scores, np.float64), number, time, colours)
 
         def is_known(head: KeyframeHead) -> bool:
-            return parts.get(LIFT, name(head)) is not None
+            return parts.get(LIFT, name(head)) is not None and parts.has(GRID, name(head))
 
         recordings: dict[str, int] = {}
         for chunk in landmark_rows.iter_keyframe_depths(store.engine, map_id, store.left_out, is_known):

@@ -27,17 +27,16 @@ from tests.integration.test_landmarks import ingest, refine
 QUERY = {"chair": (20, 9), "cup": (0, 31)}
 
 
-def complete(store: Store, map_id: int, completed: Sequence[CompletedClass]) -> None:
-    """As the step `landmarks` does it."""
+def complete(store: Store, map_id: int, completed: Sequence[CompletedClass], state: str | None = None) -> None:
+    """As the step `landmarks` does it, computed of what the map is, or was."""
     with store.engine.connect() as connection:
         known = {str(name): int(key) for name, key in connection.execute(select(categories.c.name, categories.c.id))}
-    state = store.map_state(map_id)
 
     def write(connection: object, of_map: int, found: Sequence[CompletedClass]) -> int:
         replace_completions(connection, of_map, found, known)  # type: ignore[arg-type]
         return 0
 
-    store.replace_refinement(map_id, STEP, state, {}, write, completed)
+    store.replace_refinement(map_id, STEP, state or store.map_state(map_id), {}, write, completed)
 
 
 def rows(store: Store) -> list[tuple[int, ...]]:
@@ -88,8 +87,16 @@ def test_what_is_missed_counts_until_the_map_changes(store: Store, filled: tuple
         assert_same(source, sql, 2, 3)
         query = strength_query(QUERY, 5, store.document_frequencies(map_id, list(QUERY)))
         assert ids[2] in source.filtered(query, 0.0, None).keyframe_ids
-    complete(store, map_id, [CompletedClass(ids[2], "cup", 0, 40)])  # again: nothing has changed
-    assert not sql.refresh()
+    # forgotten, and computed again: so does who opened the map in between
+    forget(store.engine, map_id, STEP)
+    between = SqlSource(store, map_id), IndexSource(MapIndex.open(store, map_id))
+    for source in between:
+        source.refresh()
+    complete(store, map_id, [CompletedClass(ids[2], "cup", 0, 40)])
+    for source in (*between, sql, memory):
+        source.refresh()
+        assert ids[2] in source.filtered(query, 0.0, None).keyframe_ids
+    assert_same(between[1], between[0], 2, 3)
     # a keyframe more, and all is as it was seen
     planned = store.plan_recording(map_id, plan("more", [0]), MODELS)
     late = store.write_keyframe(planned.recording_id, record(0, description(9, ["laptop"], keypoints=3))).keyframe_id
@@ -114,6 +121,36 @@ def test_what_is_missed_counts_until_the_map_changes(store: Store, filled: tuple
     complete(store, map_id, [CompletedClass(ids[2], "cup", 0, 40)])
     store.delete_map(map_id)
     assert rows(store) == []
+
+
+def test_what_was_computed_of_another_state_completes_nothing(store: Store, filled: tuple[int, list[int]]) -> None:
+    map_id, ids = filled
+    state = store.map_state(map_id)
+    move = "UPDATE keyframes SET tx = tx + :by WHERE id = :key"
+
+    def moved(by: float) -> None:
+        with store.engine.begin() as connection:
+            connection.execute(text(move), {"by": by, "key": ids[0]})
+
+    moved(1.0)
+    complete(store, map_id, [CompletedClass(ids[2], "cup", 0, 40)], state)
+    moved(-1.0)
+    assert (store.map_state(map_id), store.completion_of(map_id), rows(store)) == (state, None, [])
+
+
+def test_an_index_whose_log_was_cut_off_forgets_what_was_completed(store: Store, filled: tuple[int, list[int]]) -> None:
+    map_id, ids = filled
+    complete(store, map_id, [CompletedClass(ids[2], "cup", 0, 40)])
+    memory = IndexSource(MapIndex.open(store, map_id))
+    query = strength_query(QUERY, 5, store.document_frequencies(map_id, list(QUERY)))
+    assert ids[2] in memory.filtered(query, 0.0, None).keyframe_ids
+    with store.engine.begin() as connection:
+        connection.execute(text("DELETE FROM keyframe_changes"))
+        connection.execute(text("UPDATE keyframes SET tx = tx + 1 WHERE id = :key"), {"key": ids[0]})
+    memory.refresh()
+    assert store.completion_of(map_id) is None
+    assert ids[2] not in memory.filtered(query, 0.0, None).keyframe_ids
+    assert_same(memory, SqlSource(store, map_id), 5, 3)
 
 
 def test_the_step_completes_what_the_detector_missed(store: Store) -> None:

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from semdb.api.finding import find
 from semdb.cli.main import app
-from semdb.database.landmark_search import Wanted, statement
+from semdb.database.landmark_search import Wanted, as_text, statement
 from semdb.database.store import Store, open_store
 from semdb.errors import UsageError
 from semdb.exchange.formats import export_map
@@ -138,6 +138,16 @@ def test_no_table_is_read_from_end_to_end(store: Store, landmarks: list[int]) ->
         for one in (wanted, replace(wanted, perhaps=True)):
             assert len(connection.execute(statement(one)).all()) == 1
     assert [scan for scan in check.full_scans if "landmarks" in scan.split("\n")[0]] == []
+
+
+def test_how_likely_a_thing_is_of_a_class_is_asked_of_each_relation(tmp_path: Path) -> None:
+    wanted = Wanted(("cup",), near=("sink",), map_id=1, perhaps=True)
+    with open_store(f"sqlite:///{tmp_path}/m.sqlite3", create=True) as store, store.engine.connect() as connection:
+        plan = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {as_text(store.engine, wanted)}").all()
+    asked = [row[-1] for row in plan if "SEARCH landmark_categories" in row[-1]]
+    # once for what is rather another class; all else by three keys, however large the map
+    assert sum("landmark_id=?" not in line for line in asked) == 1
+    assert len(asked) > 1
 
 
 @pytest.mark.parametrize(

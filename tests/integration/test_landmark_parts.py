@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from sqlalchemy import text
+from isal import isal_zlib
+from sqlalchemy import Connection, Engine, text
 
+from semdb.database import copying_landmarks, landmark_parts, retry
 from semdb.database.copying import copy_map
-from semdb.database.landmark_parts import LandmarkParts, pack, unpack
+from semdb.database.ids import SharedIds
+from semdb.database.landmark_parts import Arrays, LandmarkParts, pack, unpack
 from semdb.database.refinements import forget
 from semdb.database.store import Store, open_store
 from semdb.refinement.landmark_step import LandmarkStep
@@ -100,6 +105,39 @@ def test_damaged_parts_are_computed_anew(store: Store, reference: dict[int, list
         assert contents(store) == reference[1]
 
 
+def test_of_a_keyframe_all_is_there_or_it_is_lifted_anew(
+    store: Store, reference: dict[int, list[object]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(landmark_parts, "MOST_WAITING", 0)  # what is large is stored as it comes
+    info = ingest(store, range(1, 6), spoiled=True)
+    refine(store, info)
+    with store.engine.begin() as connection:
+        gone = connection.execute(text("SELECT MIN(name) FROM landmark_parts WHERE kind = 'grid'")).scalar()
+        connection.execute(text("DELETE FROM landmark_parts WHERE kind = 'grid' AND name = :name"), {"name": gone})
+    stored: list[str] = []
+    put = LandmarkParts.put
+
+    def noted(self: LandmarkParts, kind: str, name: str, arrays: Arrays) -> None:
+        stored.append(kind)
+        put(self, kind, name, arrays)
+
+    monkeypatch.setattr(LandmarkParts, "put", noted)
+    forget(store.engine, info.id, LANDMARKS)
+    refine(store, info)
+    assert contents(store) == reference[1]
+    assert stored == ["lift", "grid"]
+    assert (sizes(store)["lift"], sizes(store)["grid"]) == (5, 5)
+    with store.engine.begin() as connection:  # nothing more has room: all is computed anew, and once
+        connection.execute(text("DELETE FROM landmark_parts"))
+    monkeypatch.setattr(landmark_parts, "MOST_STORED", 0)
+    for _ in range(2):
+        stored.clear()
+        forget(store.engine, info.id, LANDMARKS)
+        refine(store, info)
+        assert contents(store) == reference[1]
+        assert (stored.count("lift"), sizes(store)) == (5, {})
+
+
 def test_a_part_under_another_name_is_not_believed() -> None:
     arrays = {"a": np.arange(5), "b": np.zeros((2, 3), np.float32), "none": np.empty(0, np.bool_)}
     blob = pack("lift", "one", arrays)
@@ -115,14 +153,27 @@ def test_a_part_under_another_name_is_not_believed() -> None:
         for damaged in (bytes(spoiled), blob[: int(rng.integers(len(blob)))]):
             found = unpack("lift", "one", damaged)  # what follows the content may be anything
             assert found is None or all(np.array_equal(found[key], array) for key, array in arrays.items())
+    nothing = b"SDBL" + bytes(12) + isal_zlib.compress(b"", 1)
+    assert unpack("lift", "one", nothing) is None
     assert unpack("lift", "one", None) is None
     assert unpack("lift", "one", "text") is None
 
 
-def test_parts_do_not_leave_their_database(store: Store, tmp_path: Path, reference: dict[int, list[object]]) -> None:
+def test_parts_do_not_leave_their_database(
+    store: Store, tmp_path: Path, reference: dict[int, list[object]], monkeypatch: pytest.MonkeyPatch
+) -> None:
     info = ingest(store, range(1, 6), spoiled=True)
     refine(store, info)
+
+    def twice(engine: Engine, work: Callable[[Connection], object]) -> object:
+        with engine.connect() as connection:  # a connection that is lost
+            work(connection)
+        return retry.write(engine, work)
+
+    monkeypatch.setattr(copying_landmarks, "retry", SimpleNamespace(read=retry.read, write=twice))
     with open_store(f"sqlite:///{tmp_path}/copy.sqlite3", create=True) as other:
+        for category in ("of the copy alone", "and another one"):  # ids are others there
+            SharedIds(other.engine).categories([category])
         copy_map(store.engine, info.id, other.engine, "copy")
         copied = other.find_map("copy")
         assert contents(other) == reference[1]

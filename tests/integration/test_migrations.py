@@ -334,6 +334,19 @@ def test_keyframes_of_before_are_as_they_were_seen(engine: Engine, empty_url: st
             assert connection.execute(text(f"SELECT COUNT(*) FROM {table}")).scalar() == 0
 
 
+def test_upgrades_that_were_cut_off_go_on(engine: Engine) -> None:
+    schema.upgrade(engine)
+    for revision, cut in (("0015", ""), ("0016", "DROP TABLE map_completions"), ("0016", ""), ("0017", "")):
+        with engine.begin() as connection:
+            connection.execute(text(f"UPDATE alembic_version SET version_num = '{revision}'"))
+            if cut:
+                connection.execute(text(cut))
+        schema.upgrade(engine)
+        assert schema.current_revision(engine) == schema.HEAD
+        with engine.connect() as connection:
+            assert compare_metadata(MigrationContext.configure(connection), metadata) == []
+
+
 def test_a_database_of_before_gets_tokens(engine: Engine, empty_url: str) -> None:
     schema.upgrade(engine)
     with open_store(empty_url) as store:

@@ -171,6 +171,8 @@ class MapIndex:
 
     def _agrees(self) -> bool:
         """Whether the mirror is as the database is; what is written while they are compared is taken in first."""
+        if complete(self.store, self.map_id, self._mirror, changed=False):
+            self._unsaved += len(self._mirror)
         for _ in range(ATTEMPTS):
             if same_as_database(self.store, self.map_id, self._mirror, self._mirror.state()):
                 return True
