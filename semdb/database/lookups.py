@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
-from sqlalchemy import Connection, Engine, exists, func, select
+from sqlalchemy import Connection, Engine, Select, exists, func, select
 from sqlalchemy.sql.elements import ColumnElement
 
 from semdb.database import checked, retry
@@ -36,13 +37,7 @@ def map_heads(engine: Engine) -> list[MapHead]:
 
     A map whose rows are damaged says so itself, since the others can be used.
     """
-    holds = exists().where(keyframes.c.recording_id == recordings.c.id, recordings.c.map_id == maps.c.id)
-    heads = select(maps.c.id, maps.c.name, holds).order_by(maps.c.id)
-    m, r = models.c, refinements.c
-    made_by = select(map_models.c.map_id, m.id, m.role, m.name, m.sha256, checked.up_to(m.config, checked.MOST_JSON))
-    made_by = made_by.join(models, m.id == map_models.c.model_id).order_by(map_models.c.map_id, m.role)
-    parameters = checked.up_to(r.parameters, checked.MOST_JSON)
-    steps = select(r.map_id, r.kind, r.map_state, parameters, r.computed_at, r.row_count).order_by(r.map_id, r.kind)
+    heads, made_by, steps = _head_queries()
 
     def work(connection: Connection) -> list[MapHead]:
         infos: dict[int, list[ModelInfo]] = {}
@@ -67,6 +62,19 @@ def map_heads(engine: Engine) -> list[MapHead]:
         return found
 
     return retry.read(engine, work)
+
+
+@cache
+def _head_queries() -> tuple[Select[Any], Select[Any], Select[Any]]:
+    """Maps, their models, and what refine made of them: made once, since every image asks."""
+    holds = exists().where(keyframes.c.recording_id == recordings.c.id, recordings.c.map_id == maps.c.id)
+    heads = select(maps.c.id, maps.c.name, holds).order_by(maps.c.id)
+    m, r = models.c, refinements.c
+    made_by = select(map_models.c.map_id, m.id, m.role, m.name, m.sha256, checked.up_to(m.config, checked.MOST_JSON))
+    made_by = made_by.join(models, m.id == map_models.c.model_id).order_by(map_models.c.map_id, m.role)
+    parameters = checked.up_to(r.parameters, checked.MOST_JSON)
+    steps = select(r.map_id, r.kind, r.map_state, parameters, r.computed_at, r.row_count).order_by(r.map_id, r.kind)
+    return heads, made_by, steps
 
 
 def map_id_of(engine: Engine, name: str) -> int | None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
+from weakref import WeakKeyDictionary
 
-from sqlalchemy import BigInteger, Connection, Engine, cast, delete, func, insert, select, update
+from sqlalchemy import BigInteger, Connection, Engine, Select, cast, delete, func, insert, select, update
 from sqlalchemy.exc import IntegrityError
 
 from semdb.database import checked, retry
@@ -19,6 +20,7 @@ from semdb.types import PoseErrors
 POSE_ERRORS = "errors"  # the step of `semdb refine`
 NUMBERS = ("position_m", "position_freedom", "rotation_rad", "rotation_freedom")
 NANO = 1_000_000_000
+_measured: WeakKeyDictionary[Engine, Select[Any]] = WeakKeyDictionary()  # every query asks: making it takes longer
 
 
 def replace_pose_errors(connection: Connection, map_id: int, found: Mapping[int, PoseErrors]) -> int:
@@ -77,13 +79,19 @@ def measured_states(connection: Connection) -> dict[int, str]:
 
     Maps of which nothing is measured are left out.
     """
+    query = _measured.get(connection.engine)
+    if query is None:
+        query = _measured[connection.engine] = _measured_query(connection.engine)
+    return {map_id: " ".join(map(str, line)) for map_id, *line in connection.execute(query)}
+
+
+def _measured_query(engine: Engine) -> Select[Any]:
     e = pose_errors.c
     mixed = within(e.position_m) + 3 * within(e.rotation_rad)  # a thousandth of a micrometre shows
-    sums = exact_sum(connection.engine, cast(func.round(mixed * NANO), BigInteger))
-    numbers = exact_sum(connection.engine, cast(func.round(within(e.position_freedom) * MICRO), BigInteger))
+    sums = exact_sum(engine, cast(func.round(mixed * NANO), BigInteger))
+    numbers = exact_sum(engine, cast(func.round(within(e.position_freedom) * MICRO), BigInteger))
     query = select(recordings.c.map_id, func.count(), *sums, *numbers)
-    query = query.select_from(pose_errors.join(recordings)).group_by(recordings.c.map_id)
-    return {map_id: " ".join(map(str, line)) for map_id, *line in connection.execute(query)}
+    return query.select_from(pose_errors.join(recordings)).group_by(recordings.c.map_id)
 
 
 def map_of(engine: Engine, recording_id: int) -> int | None:
