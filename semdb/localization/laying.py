@@ -91,7 +91,6 @@ class Laying:
         """A sure pose for which few keypoints vouch, with whether the query looks as keyframes predict from there."""
         if description.grey is None or not laid.is_sure or laid.support >= options.few_support:
             return laid
-        # stretched, where it is: of less light than keyframes, whose values are not to end where those of the image do
         query = small_view(description.camera, description.grey)
 
         def look(pose: FloatArray) -> Windows:

@@ -142,12 +142,20 @@ def compare_view(
         whole = cv2.erode(there.astype(np.uint8), np.ones((WINDOW, WINDOW), np.uint8), borderValue=0) > 0
         if not whole.any():
             continue
-        shown = np.clip(np.where(there, seen, np.float32(0)), *query.span)
+        shown = np.clip(np.where(there, seen, np.float32(0)), *_span_of(seen[there], query.span))
         like, contrast = _likeness(query.grey, mean, variance, shown, whole, least, reach)
         whole &= contrast
         np.maximum(best, like, out=best, where=whole)
         compared |= whole
     return Windows(best, compared, float(known.mean()))
+
+
+def _span_of(shown: Float32Array, span: tuple[float, float]) -> tuple[float, float]:
+    """Where grey values end that a keyframe has `shown`: as those of an image of `span`, but for one of other light."""
+    if span == WHOLE:
+        return span
+    low, high = np.percentile(shown, (1, 99))  # of an image whose contrast is stretched as much lies beyond its span
+    return min(span[0], float(low)), max(span[1], float(high))
 
 
 def _likeness(

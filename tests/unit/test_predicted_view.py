@@ -148,7 +148,12 @@ def test_where_edges_were_laid_fewer_keypoints_vouch() -> None:
 def test_an_image_of_little_contrast_looks_like_one_that_is_brighter() -> None:
     """A query whose contrast was stretched, and one at a quarter of the light."""
     grey, _ = look(shifted(0.0))
-    for dim, stretch in ((grey * 0.25, None), (np.clip((grey - 60.0) / 140 * 255, 0, 255), (60.0, 200.0))):
+    dark = grey * 0.1  # 6 to 20, where keyframes have 60 to 200
+    for dim, stretch in (
+        (grey * 0.25, None),
+        (np.clip((grey - 60.0) / 140 * 255, 0, 255), (60.0, 200.0)),
+        ((dark - 6) / 14 * 255, (6.0, 20.0)),
+    ):
         query = small_view(CAMERA, np.rint(dim).astype(np.uint8), stretch=stretch)
         right, other = (compare_view(query, shifted(x), KEYFRAMES) for x in (0.0, 0.6))
         assert right.alike > 0.97
