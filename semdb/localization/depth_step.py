@@ -17,7 +17,7 @@ from semdb.types import Verdict
 
 @dataclass(frozen=True, slots=True)
 class DepthVerdictOptions:
-    """Shares (0..1), from which on likeness stands for a confidence that is too low: docs/localization.md has on what
+    """Shares (0..1), from which on likeness stands for a confidence that is too low: docs/verdict.md has on what
     they were chosen and on what judged.
     """
 

@@ -22,7 +22,7 @@ USUAL = PoseErrors(0.008, 0.007, 2.0, 2.0)  # of a recording of which nothing is
 
 @dataclass(frozen=True, slots=True)
 class ErrorModel:
-    """What errors of recorded poses make of an answer; docs/localization.md says what was fitted on what.
+    """What errors of recorded poses make of an answer; docs/verdict.md says what was fitted on what.
 
     A place is off in proportion to the distance (`pose_distances`) of the nearest keyframe, not less than at
     `place_near`, hardly more than at `place_far`, and to a power of how much one keyframe is `alone`: what several

@@ -21,7 +21,12 @@ METHODS = (
     *("posenet", "posenet-4d", "cnn-lstm", "middle-keyframe", "mean-pose"),
 )
 FIXED: Mapping[str, Entries] = {
-    "--features": (("surf", "SURF, 64 dimensions"), ("sift", "SIFT"), ("orb", "ORB, binary")),
+    "--features": (
+        ("surf", "SURF, 64 dimensions"),
+        ("surf:weak", "SURF, weak keypoints of plain images, too"),
+        ("sift", "SIFT"),
+        ("orb", "ORB, binary"),
+    ),
     "--device": (("auto", "the best there is"), ("cpu", ""), ("cuda", ""), ("mps", "Metal")),
     "--classes": (("indoor", "31 classes of COCO"), ("all", "what the detector knows")),
     "--dynamic": (("person", ""), ("person,cat,dog", ""), ("none", "nothing moves")),
