@@ -86,7 +86,7 @@ def of_room(seed: int, missed: float) -> list[Seen]:
     found = []
     for index in range(size["frames"]):
         frame = sequence.render(index)
-        depth = np.where(frame.depth > 0, frame.depth, np.nan).astype(np.float32)
+        depth = frame.known_depth
         masks = InstanceMasks(frame.labels, sequence.classes)
         made = describer.describe(frame.rgb, depth, sequence.camera, masks)
         found.append(Seen(depth, sequence.camera, frame.world_from_camera, made))

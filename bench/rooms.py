@@ -105,9 +105,8 @@ def _describe(rooms: Sequence[RenderedRoom], missed: float, confused: float, fea
         classes, made = with_misnamed(room.classes), []
         for index, frame in enumerate(room.frames):
             labels = make_mistakes(frame.labels, room.classes, missed, confused, number, index)
-            depth = np.where(frame.depth > 0, frame.depth, np.nan).astype(np.float32)
-            masks = InstanceMasks(labels, classes)
-            made.append((describer.describe(frame.rgb, depth, room.camera, masks), frame.world_from_camera))
+            described = describer.describe(frame.rgb, frame.known_depth, room.camera, InstanceMasks(labels, classes))
+            made.append((described, frame.world_from_camera))
         found.append(made)
     return found
 

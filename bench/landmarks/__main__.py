@@ -9,7 +9,6 @@ axes, with sides of 3 cm at least. Needs no model file. Seeds below 403 were tun
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from dataclasses import asdict
@@ -22,6 +21,7 @@ from bench.landmarks.rooms import (
     SPOILED_NOISY,
     class_numbers,
     render_room,
+    rooms_parser,
     seen_keyframes,
     true_things,
 )
@@ -32,11 +32,7 @@ SETTINGS = {"exact": EXACT, "mistakes": SPOILED, "exact, noisy depth": NOISY, "m
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--rooms", type=int, default=10)
-    parser.add_argument("--first", type=int, default=410)
-    parser.add_argument("--keyframes", type=int, default=24)
-    parser.add_argument("--width", type=int, default=640)
+    parser = rooms_parser(__doc__)
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     scores: dict[str, list[Score]] = {name: [] for name in SETTINGS}

@@ -13,7 +13,6 @@ below 403 were tuned on.
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bench.landmarks.__main__ import SETTINGS
-from bench.landmarks.rooms import Mistakes, RenderedRoom, class_numbers, render_visit, seen_keyframes
+from bench.landmarks.rooms import Mistakes, RenderedRoom, class_numbers, render_visit, rooms_parser, seen_keyframes
 from bench.landmarks.scores import SEEN, main_label
 from semdb.landmarks.build import SeenKeyframe, find_landmarks
 from semdb.landmarks.changes import Change, SeenIn, VisitedThing, find_changes
@@ -189,11 +188,7 @@ def summed(found: Sequence[Told]) -> Told:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--rooms", type=int, default=10)
-    parser.add_argument("--first", type=int, default=410)
-    parser.add_argument("--keyframes", type=int, default=24)
-    parser.add_argument("--width", type=int, default=640)
+    parser = rooms_parser(__doc__)
     given = parser.parse_args()
     found: dict[str, list[Told]] = {name: [] for name in SETTINGS}
     for seed in range(given.first, given.first + given.rooms):

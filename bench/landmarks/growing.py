@@ -68,8 +68,8 @@ def room_records(seed: int, keyframes: int, width: int, *, noise: bool) -> list[
     found = []
     for index in range(keyframes):
         frame = sequence.render(index)
-        depth = np.where(frame.depth > 0, frame.depth, np.nan).astype(np.float32)
-        made = describer.describe(frame.rgb, depth, sequence.camera, InstanceMasks(frame.labels, sequence.classes))
+        masks = InstanceMasks(frame.labels, sequence.classes)
+        made = describer.describe(frame.rgb, frame.known_depth, sequence.camera, masks)
         image = cv2.imencode(".jpg", frame.rgb[..., ::-1])[1].tobytes()
         packed = encode_16bit(np.rint(frame.depth * 5000).astype(np.uint16))
         found.append(
@@ -143,7 +143,7 @@ def main() -> None:
     parser.add_argument("--keyframes", type=int, default=50)
     parser.add_argument("--added", type=int, default=2)
     parser.add_argument("--width", type=int, default=640)
-    parser.add_argument("--noise", action="store_true", help="noisy depth, 30 % missed, 15 % misnamed")
+    parser.add_argument("--noise", action="store_true", help="noisy depth, 30 %% missed, 15 %% misnamed")
     parser.add_argument("--spread", action="store_true", help="what is added is of all rooms")
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()

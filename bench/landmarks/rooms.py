@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -87,6 +88,16 @@ class TrueThing:
     category: str
     box: Box
     keyframes: int
+
+
+def rooms_parser(what: str | None, rooms: int = 10) -> argparse.ArgumentParser:
+    """The arguments of a bench over rendered rooms of successive seeds; the first line of `what` says what it is."""
+    parser = argparse.ArgumentParser(description=(what or "").splitlines()[0])
+    parser.add_argument("--rooms", type=int, default=rooms)
+    parser.add_argument("--first", type=int, default=410)
+    parser.add_argument("--keyframes", type=int, default=24)
+    parser.add_argument("--width", type=int, default=640)
+    return parser
 
 
 def render_room(seed: int, keyframes: int = 24, width: int = 640, place: int = 0, laps: int = 1) -> RenderedRoom:

@@ -12,7 +12,6 @@ that no thing is an answer to (0.3 or less), and how many of them find nothing. 
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -29,6 +28,7 @@ from bench.landmarks.rooms import (
     class_numbers,
     confusion_of,
     render_room,
+    rooms_parser,
     seen_keyframes,
     true_things,
 )
@@ -226,11 +226,7 @@ def tallies(asked: Sequence[Asked]) -> dict[str, Tally]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--rooms", type=int, default=10)
-    parser.add_argument("--first", type=int, default=410)
-    parser.add_argument("--keyframes", type=int, default=24)
-    parser.add_argument("--width", type=int, default=640)
+    parser = rooms_parser(__doc__)
     given = parser.parse_args()
     asked: dict[str, list[Asked]] = {name: [] for name in SETTINGS}
     with (

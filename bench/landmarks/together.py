@@ -7,12 +7,19 @@ many seeds, the middles of neighbours 20 m apart, are one map of one recording; 
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Iterator, Sequence
 
 from bench.landmarks.__main__ import SETTINGS
-from bench.landmarks.rooms import RenderedRoom, TrueThing, class_numbers, render_room, seen_keyframes, true_things
+from bench.landmarks.rooms import (
+    RenderedRoom,
+    TrueThing,
+    class_numbers,
+    render_room,
+    rooms_parser,
+    seen_keyframes,
+    true_things,
+)
 from bench.landmarks.scores import HEADER, score
 from semdb.landmarks.build import SeenKeyframe, find_landmarks
 from semdb.landmarks.values import Landmarks
@@ -64,11 +71,7 @@ def names_of(first: int, rooms: int) -> dict[str, int]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--rooms", type=int, default=20)
-    parser.add_argument("--first", type=int, default=410)
-    parser.add_argument("--keyframes", type=int, default=24)
-    parser.add_argument("--width", type=int, default=640)
+    parser = rooms_parser(__doc__, rooms=20)
     parser.add_argument("--settings", nargs="+", choices=list(SETTINGS), default=["exact", "mistakes"])
     given = parser.parse_args()
     building = Building(given.settings, names_of(given.first, given.rooms))

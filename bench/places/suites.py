@@ -132,8 +132,7 @@ def _room(group: Sequence[SyntheticOptions], work: Path) -> tuple[ImageArray, Fl
         for index in range(options.frames):
             frame = sequence.render(index)
             images.append(frame.rgb)
-            depth = np.where(frame.depth > 0, frame.depth, np.nan).astype(np.float32)
-            grids.append(view_grid(sequence.camera, depth))
+            grids.append(view_grid(sequence.camera, frame.known_depth))
             poses.append(frame.world_from_camera)
     shown, common = np.stack(images), _common(grids, poses)
     np.savez_compressed(path, images=shown, common=common)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from semdb.geometry import invert_pose
@@ -40,7 +41,7 @@ class Viewing:
     def _from(self, query: SmallView, pose: FloatArray) -> tuple[list[PlacedView], bool]:
         return self.cache.views_seen_from(pose, query, self.options.keyframes)
 
-    def _laid(self, query: SmallView, edges: ImageEdges, seen: Seen, times: int) -> Seen:
+    def _laid(self, query: SmallView, edges: Callable[[], ImageEdges], seen: Seen, times: int) -> Seen:
         """The same with the edges of the query laid on those of the keyframes, while it is more alike then."""
         options, rounds = self.options, self.options.edges
         for _ in range(times):
@@ -48,7 +49,7 @@ class Viewing:
                 break
             pose = seen.world_from_camera
             views = self._from(query, pose)[0][: rounds.keyframes]
-            fit = fit_edges(edges, self.cache.edges_of(views), pose, (*rounds.coarse[1:], *rounds.fine))
+            fit = fit_edges(edges(), self.cache.edges_of(views), pose, (*rounds.coarse[1:], *rounds.fine))
             found = None if fit is None else self.see(query, fit.world_from_camera)
             if found is None or found.alike <= seen.alike:
                 break
@@ -95,7 +96,8 @@ class Viewing:
         looked_at = self._of_keypoints(search, query)
         if looked_at is None:
             return None
-        (seen, unseen), edges = looked_at, image_edges(description.camera, description.grey)
+        seen, unseen = looked_at
+        edges = functools.cache(functools.partial(image_edges, description.camera, description.grey))
         seen = [self._laid(query, edges, one, 1) for one in seen]
         found = replace(stand(seen, self.options), unseen=unseen) if seen else None
         if found is None or found.best.alike < self.options.worth_trusting:

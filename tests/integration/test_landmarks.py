@@ -37,10 +37,9 @@ def records(spoiled: bool = False) -> tuple[KeyframeRecord, ...]:
     found, frames = [], [sequence.render(index) for index in range(FRAMES)]
     largest = max(sequence.classes, key=lambda label: min(np.count_nonzero(frame.labels == label) for frame in frames))
     for index, frame in enumerate(frames):
-        depth = np.where(frame.depth > 0, frame.depth, np.nan).astype(np.float32)
         labels = np.where(frame.labels == largest, 0, frame.labels) if spoiled and index == 2 else frame.labels
         masks = InstanceMasks(labels, sequence.classes)
-        made = describer.describe(frame.rgb, depth, sequence.camera, masks)
+        made = describer.describe(frame.rgb, frame.known_depth, sequence.camera, masks)
         packed = encode_16bit(np.rint(frame.depth * 5000).astype(np.uint16))
         pose = frame.world_from_camera
         time = 1_700_000_000_000_000_000 + index * 10**9

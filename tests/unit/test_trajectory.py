@@ -62,7 +62,7 @@ def rendered(options: SyntheticOptions) -> Frames:
     pictures: list[Picture | None] = []
     for index in range(options.frames):
         frame = sequence.render(index)
-        pictures.append((frame.rgb, np.where(frame.depth > 0, frame.depth, np.nan).astype(np.float32)))
+        pictures.append((frame.rgb, frame.known_depth))
     return Frames(sequence.camera, pictures, sequence.poses)
 
 

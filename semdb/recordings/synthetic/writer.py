@@ -43,6 +43,11 @@ class SyntheticFrame:
     labels: npt.NDArray[np.uint16]  # [H, W]
     world_from_camera: FloatArray  # [4, 4]
 
+    @property
+    def known_depth(self) -> Float32Array:
+        """Depth ``[H, W]`` float32 in metres, NaN for none: as recordings give it."""
+        return np.where(self.depth > 0, self.depth, np.nan).astype(np.float32)
+
 
 _first_visit = lru_cache(maxsize=2)(build_room)
 
