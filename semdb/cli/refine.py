@@ -50,8 +50,10 @@ def command(
 
     steps_of(step or ())
     if frames:
-        if step or up:
-            raise UsageError("--frames does nothing else: leave out --step and --up")
+        if step or up or force:
+            raise UsageError(
+                "--frames does nothing else: leave out --step, --up and --force (frames are always read anew)"
+            )
         options = {"map": map_name, "name": name, "camera": camera}
         _add_frames(overrides, frames, options, json)
         return

@@ -256,7 +256,7 @@ def test_the_command(room: Path, url: str, tmp_path: Path) -> None:
     run = CliRunner().invoke(app, ["refine", "--name", "room", "--database-url", f"sqlite:///{copy}"])
     assert run.exit_code == 2
     assert "--name: only with --frames" in run.output
-    for extra in (["--step", "points"], ["--up", "0,0,1"]):
+    for extra in (["--step", "points"], ["--up", "0,0,1"], ["--force"]):
         run = CliRunner().invoke(app, ["refine", "--frames", str(room), "--database-url", f"sqlite:///{copy}", *extra])
         assert run.exit_code == 2
     with open_store(f"sqlite:///{copy}") as store:
