@@ -74,6 +74,7 @@ def fill(store: Store, number: int, per_map: int = 1000) -> None:
                     {
                         **{"landmark_id": a, "kind": kind, "other_landmark_id": b},
                         **{"score": float(rng.uniform(0.3, 1)), "other_category_id": classes[b - made - 1]},
+                        **{"category_id": classes[a - made - 1], "map_id": map_id},
                     }
                     for a, kind, b in sorted(related)
                 ],

@@ -159,6 +159,7 @@ def write(
             {
                 **{"landmark_id": keys[r.one], "kind": str(r.kind), "other_landmark_id": keys[r.other]},
                 **{"score": r.score, "other_category_id": ids[names[found.landmarks[r.other].category]]},
+                **{"category_id": ids[names[found.landmarks[r.one].category]], "map_id": map_id},
             }
             for r in find_relations(found.landmarks, names, found.gravity.up)
         ]

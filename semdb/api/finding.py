@@ -189,10 +189,10 @@ def _viewpoint(row: Any) -> Viewpoint | None:
 
 def _missing(store: Store, wanted: Wanted, meant: Mapping[str, Understood]) -> Missing:
     """Which of three it is that nothing was found."""
-    from semdb.database import landmark_search as rows
+    from semdb.database.landmark_unfound import unfound
 
     said = meant["what"].said
-    known = rows.unfound(store.engine, wanted)
+    known = unfound(store.engine, wanted)
     usual = tuple({"relation": kind, "category": name, "count": number} for kind, name, number in known.usual)
     there, gone = known.there, known.gone
     for part, seen in known.anchors.items():

@@ -44,7 +44,8 @@ def copy_landmarks(
     completed = _completed(source, map_id, keyframes)
     # here and not below, which may be run again
     for row in hanging[landmark_tables.landmark_relations]:
-        row["other_category_id"] = categories.get(int(row["other_category_id"] or 0))
+        row |= {name: categories.get(int(row[name] or 0)) for name in ("category_id", "other_category_id")}
+        row["map_id"] = target_map_id
     for row in (*hanging[landmark_tables.landmark_categories], *completed.get(tables.completed_categories, ())):
         row["category_id"] = categories[int(row["category_id"])]
     for row in (row for found in (hanging[landmark_tables.landmark_categories], *completed.values()) for row in found):

@@ -182,6 +182,7 @@ def replace_landmarks(connection: Connection, map_id: int, found: LandmarkSet, k
         {
             **{"landmark_id": ids[r.one], "kind": r.kind, "other_landmark_id": ids[r.other], "score": r.score},
             "other_category_id": known[found.landmarks[r.other].category],
+            **{"category_id": known[found.landmarks[r.one].category], "map_id": map_id},
         }
         for r in found.relations
     ]

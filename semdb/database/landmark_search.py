@@ -7,7 +7,7 @@ found, what is known of that.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -24,6 +24,7 @@ from sqlalchemy import (
     exists,
     func,
     literal,
+    null,
     or_,
     select,
     union_all,
@@ -47,9 +48,9 @@ TENTATIVE = 0.5  # of the score of a confirmed landmark
 WALK_M = 5.0  # from the origin: a landmark so far away has half the score
 NOT_NEAR = 0.5  # a relation of this score is one
 MOST_SIGHTINGS = 20  # of a hit
-MOST_LISTED = 5  # of what is known where nothing is found
-MOST_COUNTED = 200  # landmarks, of which it is counted where they stand
 CONFIRMED, GONE = "confirmed", "gone"
+THERE = (CONFIRMED, "tentative")
+UNIT = 1e12  # probabilities are summed as whole multiples of its inverse
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +73,7 @@ class Wanted:
 
 
 @dataclass(frozen=True, slots=True)
-class _Shape:
+class Shape:
     """What a search asks for, without the values: such statements are made once."""
 
     near: bool
@@ -85,17 +86,17 @@ class _Shape:
     perhaps: bool
 
 
-def _shape(wanted: Wanted) -> _Shape:
-    return _Shape(
+def shape_of(wanted: Wanted) -> Shape:
+    return Shape(
         *(bool(wanted.near), bool(wanted.on), bool(wanted.not_near), wanted.map_id is not None),
         *(wanted.seen_after_ns is not None, wanted.seen_in is not None, wanted.origin is not None),
         wanted.perhaps,
     )
 
 
-def _values(wanted: Wanted) -> dict[str, Any]:
+def values_of(wanted: Wanted) -> dict[str, Any]:
     """The values of the parameters of its statement."""
-    shape, found = _shape(wanted), {"classes": list(wanted.classes), "most": wanted.limit}
+    shape, found = shape_of(wanted), {"classes": list(wanted.classes), "most": wanted.limit}
     found |= {name: list(getattr(wanted, name)) for name in ("near", "on", "not_near") if getattr(shape, name)}
     names = ("map_id", "seen_after_ns", "seen_in")
     found |= {name: getattr(wanted, name) for name in names if getattr(shape, name)}
@@ -104,55 +105,26 @@ def _values(wanted: Wanted) -> dict[str, Any]:
     return found
 
 
-def _ids_of(names: str | Sequence[str]) -> Any:
+def ids_of(names: str | Sequence[str]) -> Any:
     """Ids of classes by their names, or by those of a parameter."""
     listed: Any = bindparam(names, expanding=True) if isinstance(names, str) else names
     return select(categories.c.id).where(categories.c.name.in_(listed))
 
 
-def _related(names: str, kinds: Sequence[str]) -> Select[Any]:
-    """Relations of the landmark of the query around to any of the classes."""
-    r = landmark_relations.c  # of landmarks that are gone there are none
-    return (
-        select(r.score)
-        .where(r.landmark_id == landmarks.c.id, r.other_category_id.in_(_ids_of(names)), r.kind.in_(kinds))
-        .correlate(landmarks)
-    )
-
-
 def statement(wanted: Wanted) -> Select[Any]:
     """The search as one statement: the best landmarks, the best first, with the parts of their scores."""
-    return _statement(_shape(wanted)).params(**_values(wanted))
+    return _statement(shape_of(wanted)).params(**values_of(wanted))
 
 
 @lru_cache(maxsize=128)
-def _statement(wanted: _Shape) -> Select[Any]:
-    m = landmarks.c
-    conditions = _conditions(wanted)
-    one: ColumnElement[Any] = literal(1.0)
-    near = one if not wanted.near else _relation("near", NEAR, perhaps=wanted.perhaps)
-    on = one if not wanted.on else _relation("on", ON, perhaps=wanted.perhaps)
-    state = case((m.state == CONFIRMED, 1.0), else_=TENTATIVE)
-    squared: ColumnElement[Any] = literal(0.0)
-    if wanted.origin:
-        x, y, z = (bindparam(name, type_=Double) for name in ("from_x", "from_y", "from_z"))
-        squared = (m.x - x) * (m.x - x) + (m.y - y) * (m.y - y) + (m.z - z) * (m.z - z)
-    parts = (
-        near.label("near_score"),
-        on.label("on_score"),
-        state.label("state_score"),
-        (WALK_M * WALK_M / (WALK_M * WALK_M + squared)).label("distance_score"),
-        squared.label("distance_squared"),
-    )
-    rows = select(m.id.label("landmark_id"), m.probability.label("class_score"), *parts).where(
-        m.category_id.in_(_ids_of("classes")), *conditions
-    )
-    scored = (_with_others(rows, parts, conditions, wanted) if wanted.perhaps else rows).subquery("scored")
+def _statement(wanted: Shape) -> Select[Any]:
+    rows = _placed(wanted) if wanted.near or wanted.on else _all(wanted)
+    scored = rows.subquery("scored")
     s = scored.c
     score = (s.class_score * s.near_score * s.on_score * s.state_score * s.distance_score).label("score")
     best = (
         select(*s, score)
-        .where(s.near_score.is_not(None), s.on_score.is_not(None))
+        .where(s.class_score.is_not(None))
         .order_by(score.desc(), s.landmark_id)
         .limit(bindparam("most", type_=Integer))
         .subquery("best")
@@ -160,59 +132,134 @@ def _statement(wanted: _Shape) -> Select[Any]:
     return _with_details(best)
 
 
-def _with_others(rows: Select[Any], parts: Any, conditions: Sequence[Any], wanted: _Shape) -> CompoundSelect[Any]:
-    """`rows`, and those of landmarks that are rather of another class."""
-    m, rather = landmarks.c, _rather_something_else(wanted)
+def _parts(wanted: Shape, near: Any = None, on: Any = None) -> tuple[ColumnElement[Any], ...]:
+    """What the score of a landmark is made of besides its class, and how far away it is."""
+    m = landmarks.c
+    one: ColumnElement[Any] = literal(1.0)
+    squared: ColumnElement[Any] = literal(0.0)
+    if wanted.origin:
+        x, y, z = (bindparam(name, type_=Double) for name in ("from_x", "from_y", "from_z"))
+        squared = (m.x - x) * (m.x - x) + (m.y - y) * (m.y - y) + (m.z - z) * (m.z - z)
+    return (
+        (one if near is None else near.c.score).label("near_score"),
+        (one if on is None else on.c.score).label("on_score"),
+        case((m.state == CONFIRMED, 1.0), else_=TENTATIVE).label("state_score"),
+        (WALK_M * WALK_M / (WALK_M * WALK_M + squared)).label("distance_score"),
+        squared.label("distance_squared"),
+    )
+
+
+def _all(wanted: Shape) -> Select[Any] | CompoundSelect[Any]:
+    """Landmarks of the classes, and with `perhaps` those that are rather of another one."""
+    m, parts = landmarks.c, _parts(wanted)
+    rows = select(m.id.label("landmark_id"), m.probability.label("class_score"), *parts)
+    rows = rows.where(m.category_id.in_(ids_of("classes")), *conditions(wanted))
+    if wanted.not_near:
+        rows = rows.where(m.id.not_in(_related("not_near", wanted).where(landmark_relations.c.score >= NOT_NEAR)))
+    if not wanted.perhaps:
+        return rows
+    rather = _rather_something_else(wanted)
     others = select(m.id.label("landmark_id"), rather.c.class_score, *parts)
     others = others.select_from(rather.join(landmarks, m.id == rather.c.landmark_id))
-    return union_all(rows, others.where(m.category_id.not_in(_ids_of("classes")), *conditions))
+    others = others.where(m.category_id.not_in(ids_of("classes")), *conditions(wanted))
+    return union_all(rows, others.where(~_stands_near()) if wanted.not_near else others)
 
 
-def _rather_something_else(wanted: _Shape) -> Subquery:
-    """Landmarks that are rather of another class, but may be of one that is looked for, and how likely."""
-    c = landmark_categories.c
-    found = select(c.landmark_id, func.sum(c.probability).label("class_score")).where(
-        c.category_id.in_(_ids_of("classes"))
-    )
-    if wanted.map_id:
-        found = found.where(c.map_id == bindparam("map_id"))
-    return found.group_by(c.landmark_id).subquery("rather")
+def _placed(wanted: Shape) -> Select[Any]:
+    """As `_all`, of landmarks that stand so: begins with their relations, which are few of those of a large map."""
+    m = landmarks.c
+    near = _relation("near", NEAR, wanted).subquery("near") if wanted.near else None
+    on = _relation("on", ON, wanted).subquery("on_") if wanted.on else None
+    first, second = (near, on) if near is not None else (on, None)
+    assert first is not None
+    joined: Any = first
+    if second is not None:
+        joined = joined.join(second, second.c.landmark_id == first.c.landmark_id)
+    joined = joined.join(landmarks, m.id == first.c.landmark_id)
+    is_one = m.category_id.in_(ids_of("classes"))
+    likely = case((is_one, m.probability))
+    if wanted.perhaps:
+        rather = _rather_something_else(wanted)
+        joined = joined.outerjoin(rather, rather.c.landmark_id == m.id)
+        likely = case((is_one, m.probability), else_=rather.c.class_score)
+    rows = select(m.id.label("landmark_id"), likely.label("class_score"), *_parts(wanted, near, on)).select_from(joined)
+    rows = rows.where(*conditions(replace(wanted, map_id=False)))  # relations are of the map
+    return rows.where(~_stands_near()) if wanted.not_near else rows
 
 
-def _relation(names: str, kinds: Sequence[str], *, perhaps: bool) -> ColumnElement[Any]:
-    """The highest score of a relation of the landmark of the query around to any of the classes; null without any.
+def _rather_something_else(wanted: Shape) -> Subquery:
+    """Landmarks that are rather of another class, but may be of one that is looked for, and how likely.
 
-    With `perhaps`, where it has none, one to what may be of them counts as much less as it is less likely. How likely
-    is asked for each relation of the landmark, not the other way round: of a class there may be many in a map.
+    Sums are of whole numbers, so that they do not depend on the order of classes.
     """
-    r, c = landmark_relations.c, landmark_categories.c
-    sure = _related(names, kinds).with_only_columns(func.max(r.score)).correlate(landmarks).scalar_subquery()
-    if not perhaps:
-        return sure
-    likely = (
-        select(func.max(c.probability))
-        .where(c.category_id.in_(_ids_of(names)), c.map_id == landmarks.c.map_id, c.landmark_id == r.other_landmark_id)
-        .correlate(landmarks, landmark_relations)
-        .scalar_subquery()
+    c = landmark_categories.c
+    likely = func.sum(func.round(c.probability * UNIT)) / UNIT
+    return (
+        _perhaps("classes", wanted, c.landmark_id, likely.label("class_score"))
+        .group_by(c.landmark_id)
+        .subquery("rather")
     )
-    possible = (
-        select(func.max(r.score * likely))
-        .where(r.landmark_id == landmarks.c.id, r.kind.in_(kinds))
-        .correlate(landmarks)
-        .scalar_subquery()
-    )
-    return func.coalesce(sure, possible)
 
 
-def _conditions(wanted: _Shape, *, gone: bool = False) -> list[ColumnElement[bool]]:
+def _perhaps(names: str, wanted: Shape, *columns: Any, of: Any = landmark_categories) -> Select[Any]:
+    """Rows of landmarks that may be of the classes, but are rather of another."""
+    found = select(*columns).where(of.c.category_id.in_(ids_of(names)))
+    return found.where(of.c.map_id == bindparam("map_id")) if wanted.map_id else found
+
+
+def _related(names: str, wanted: Shape, kinds: Sequence[str] = NEAR) -> Select[Any]:
+    """Landmarks of the classes looked for with a relation to any of the classes `names`: one range of an index.
+
+    Of landmarks that are gone there are none.
+    """
+    r = landmark_relations.c
+    found = select(r.landmark_id).where(
+        r.category_id.in_(ids_of("classes")), r.other_category_id.in_(ids_of(names)), r.kind.in_(kinds)
+    )
+    return found.where(r.map_id == bindparam("map_id")) if wanted.map_id else found
+
+
+def _stands_near() -> ColumnElement[bool]:
+    """Whether the landmark of the query around stands near what it should not."""
+    r = landmark_relations.c
+    there = select(literal(1)).where(
+        *(r.landmark_id == landmarks.c.id, r.other_category_id.in_(ids_of("not_near"))),
+        *(r.kind.in_(NEAR), r.score >= NOT_NEAR),
+    )
+    return exists(there.correlate(landmarks))
+
+
+def _relation(names: str, kinds: Sequence[str], wanted: Shape) -> Select[Any]:
+    """Landmarks that are looked for, and the highest score of a relation of each to any of the classes `names`.
+
+    With `perhaps`, where it has none, one to what may be of them counts as much less as it is less likely.
+    """
+    r, other = landmark_relations.c, landmark_categories.alias("other")
+    sure = _related(names, wanted, kinds).add_columns(r.score.label("sure"))
+    if not wanted.perhaps:
+        return sure.with_only_columns(r.landmark_id, func.max(r.score).label("score")).group_by(r.landmark_id)
+    nothing = null().label("possible")
+    rather = landmark_categories.alias("rather_")
+    others = _perhaps("classes", wanted, r.landmark_id, r.score, nothing, of=rather)
+    others = others.select_from(rather.join(landmark_relations, r.landmark_id == rather.c.landmark_id))
+    others = others.where(r.other_category_id.in_(ids_of(names)), r.kind.in_(kinds))
+    either = or_(
+        r.category_id.in_(ids_of("classes")),
+        r.landmark_id.in_(_perhaps("classes", wanted, landmark_categories.c.landmark_id)),
+    )
+    possible = _perhaps(names, wanted, r.landmark_id, null(), r.score * other.c.probability, of=other)
+    possible = possible.select_from(other.join(landmark_relations, r.other_landmark_id == other.c.landmark_id))
+    every = union_all(sure.add_columns(nothing), others, possible.where(r.kind.in_(kinds), either)).subquery("every")
+    score = func.coalesce(func.max(every.c.sure), func.max(every.c.possible)).label("score")
+    return select(every.c.landmark_id, score).group_by(every.c.landmark_id)
+
+
+def conditions(wanted: Shape, *, gone: bool = False) -> list[ColumnElement[bool]]:
     """What a landmark has to be besides of a class."""
     m = landmarks.c
-    found = [m.state == GONE if gone else m.state != GONE]
+    found = [m.state == GONE if gone else m.state.in_(THERE)]
     if wanted.map_id:
         found.append(m.map_id == bindparam("map_id"))
-    if wanted.not_near:
-        there = _related("not_near", NEAR).where(landmark_relations.c.score >= NOT_NEAR)
-        found.append(~exists(there.with_only_columns(literal(1))))
     if wanted.seen_after_ns:
         found.append(m.last_seen_ns >= bindparam("seen_after_ns"))
     if wanted.seen_in:
@@ -268,10 +315,10 @@ def as_text(engine: Engine, wanted: Wanted) -> str:
 
 def search(engine: Engine, wanted: Wanted) -> tuple[list[Any], dict[int, list[Any]]]:
     """The rows of `statement`, and the sightings that speak for each landmark (see `sightings_of`)."""
-    query = statement(wanted)
+    query, values = _statement(shape_of(wanted)), values_of(wanted)  # apart: what is made of a statement is kept
 
     def work(connection: Connection) -> tuple[list[Any], dict[int, list[Any]]]:
-        found = list(connection.execute(query))
+        found = list(connection.execute(query, values))
         return found, sightings_of(connection, [int(row.landmark_id) for row in found])
 
     return retry.read(engine, work)
@@ -303,118 +350,6 @@ def _sightings_statement() -> Select[Any]:
             .join(categories, categories.c.id == o.category_id)
         )
         .where(s.landmark_id.in_(bindparam("ids", expanding=True)))
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class Unfound:
-    """What is known of the classes of a search that found nothing.
-
-    `there`, `gone`: landmarks of them that are not gone, whatever else was asked, and that are; a few, the last seen
-    first. `anchors`: whether there are landmarks of the classes that it was to stand near, and on. `objects`: how many
-    objects keyframes show of the classes, counted where no landmark is there. `usual`: see `_usual_places`.
-    """
-
-    there: list[Any]
-    gone: list[Any]
-    anchors: dict[str, bool]
-    objects: int
-    usual: list[tuple[str, str, int]]
-
-
-def unfound(engine: Engine, wanted: Wanted) -> Unfound:
-    """What is known where `search` found nothing, as of one moment."""
-    plain = Wanted(wanted.classes, map_id=wanted.map_id, limit=MOST_LISTED)
-
-    def work(connection: Connection) -> Unfound:
-        there, gone = (_listed(connection, plain, gone=gone) for gone in (False, True))
-        parts = (("near", wanted.near), ("on", wanted.on))
-        known = {name: _any_of(connection, classes, wanted.map_id) for name, classes in parts if classes}
-        number = 0 if there or gone else _objects_of(connection, wanted.classes, wanted.map_id)
-        return Unfound(there, gone, known, number, _usual_places(connection, wanted.classes))
-
-    return retry.read(engine, work)
-
-
-def _listed(connection: Connection, wanted: Wanted, *, gone: bool) -> list[Any]:
-    return list(connection.execute(_list_statement(_shape(wanted), gone), _values(wanted)))
-
-
-@lru_cache(maxsize=16)
-def _list_statement(wanted: _Shape, gone: bool) -> Select[Any]:
-    """A few landmarks, the last seen first: chosen before anything is looked up of them."""
-    m = landmarks.c
-    last, last_of = keyframes.alias("last"), recordings.alias("last_of")
-    newest = (
-        select(m.id, m.last_seen_ns)
-        .where(m.category_id.in_(_ids_of("classes")), *_conditions(wanted, gone=gone))
-        .order_by(m.last_seen_ns.desc(), m.id)
-        .limit(bindparam("most", type_=Integer))
-        .subquery("newest")
-    )
-    return (
-        select(m.id, categories.c.name.label("category"), maps.c.name.label("map"), m.x, m.y, m.z, m.last_seen_ns)
-        .add_columns(last_of.c.name.label("last_recording"), last.c.frame_index.label("last_frame_index"))
-        .select_from(
-            newest.join(landmarks, m.id == newest.c.id)
-            .join(categories, categories.c.id == m.category_id)
-            .join(maps, maps.c.id == m.map_id)
-            .outerjoin(last, last.c.id == m.last_keyframe_id)
-            .outerjoin(last_of, last_of.c.id == last.c.recording_id)
-        )
-        .order_by(newest.c.last_seen_ns.desc(), newest.c.id)
-    )
-
-
-def _any_of(connection: Connection, names: Sequence[str], map_id: int | None) -> bool:
-    """Whether there are landmarks of these classes, gone or not."""
-    statement, values = _any_statement(map_id is not None), {"classes": list(names), "map_id": map_id}
-    return connection.execute(statement, values if map_id is not None else {"classes": list(names)}).first() is not None
-
-
-@lru_cache(maxsize=2)
-def _any_statement(in_map: bool) -> Select[Any]:
-    found = select(literal(1)).select_from(landmarks).where(landmarks.c.category_id.in_(_ids_of("classes"))).limit(1)
-    return found.where(landmarks.c.map_id == bindparam("map_id")) if in_map else found
-
-
-def _objects_of(connection: Connection, names: Sequence[str], map_id: int | None) -> int:
-    """How many objects of these classes keyframes show."""
-    query = select(func.count()).select_from(objects.join(keyframes).join(recordings))
-    query = query.where(objects.c.category_id.in_(_ids_of(names)))
-    if map_id is not None:
-        query = query.where(recordings.c.map_id == map_id)
-    return int(connection.execute(query).scalar() or 0)
-
-
-def _usual_places(connection: Connection, names: Sequence[str]) -> list[tuple[str, str, int]]:
-    """On, in or beside what the newest `MOST_COUNTED` landmarks of these classes stand in this database: kind, class,
-    how many; most first.
-    """
-    rows = connection.execute(_usual_statement(), {"classes": list(names)})
-    return [(str(kind), str(name), int(count)) for kind, name, count in rows]
-
-
-@lru_cache(maxsize=1)
-def _usual_statement() -> Select[Any]:
-    """Counted by the ids of classes, which get their names afterwards."""
-    r, m = landmark_relations.c, landmarks.c
-    newest = select(m.id).where(m.category_id.in_(_ids_of("classes"))).order_by(m.id.desc()).limit(MOST_COUNTED)
-    counted = newest.subquery("newest")  # servers want no limit inside of IN
-    numbers = (
-        select(r.kind, r.other_category_id, func.count().label("number"))
-        .select_from(counted.join(landmark_relations, r.landmark_id == counted.c.id))
-        .where(r.score >= NOT_NEAR)
-        .where(or_(r.kind == "on", r.kind == "in", r.kind == "next_to"))
-        .group_by(r.kind, r.other_category_id)
-        .subquery("numbers")
-    )
-    n = numbers.c
-    return (
-        select(n.kind, categories.c.name, n.number)
-        .select_from(numbers.join(categories, categories.c.id == n.other_category_id))
-        .order_by(n.number.desc(), n.kind.desc(), categories.c.name)
-        .limit(MOST_LISTED)
     )
 
 

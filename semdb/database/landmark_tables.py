@@ -85,7 +85,10 @@ landmark_relations = table(
     reference("other_landmark_id", "landmarks.id", primary_key=True),
     Column("score", Double, nullable=False),
     Column("other_category_id", Id),
-    Index(None, "other_landmark_id", "kind"),
+    Column("category_id", Id),
+    Column("map_id", Id),
+    Index("ix_landmark_relations_other", "other_landmark_id", "category_id", "kind", "landmark_id", "score"),
+    Index("ix_landmark_relations_pair", "category_id", "other_category_id", "map_id", "kind", "landmark_id", "score"),
     Index(None, "landmark_id", "other_category_id", "kind", "score"),
 )
 

@@ -34,6 +34,7 @@ REVISIONS = (
     "0016",
     "0017",
     "0018",
+    "0019",
 )
 HEAD = REVISIONS[-1]
 _NOT_ALLOWED = {1044, 1142, 1227}

@@ -140,14 +140,17 @@ def test_no_table_is_read_from_end_to_end(store: Store, landmarks: list[int]) ->
     assert [scan for scan in check.full_scans if "landmarks" in scan.split("\n")[0]] == []
 
 
-def test_how_likely_a_thing_is_of_a_class_is_asked_of_each_relation(tmp_path: Path) -> None:
+def test_what_of_one_class_stands_near_another_is_one_range_of_an_index(tmp_path: Path) -> None:
     wanted = Wanted(("cup",), near=("sink",), map_id=1, perhaps=True)
     with open_store(f"sqlite:///{tmp_path}/m.sqlite3", create=True) as store, store.engine.connect() as connection:
         plan = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {as_text(store.engine, wanted)}").all()
-    asked = [row[-1] for row in plan if "SEARCH landmark_categories" in row[-1]]
-    # once for what is rather another class; all else by three keys, however large the map
-    assert sum("landmark_id=?" not in line for line in asked) == 1
-    assert len(asked) > 1
+    related, things = (
+        [row[-1] for row in plan if f"SEARCH {name} " in row[-1]] for name in ("landmark_relations", "landmarks")
+    )
+    assert len(related) == 3  # of these classes, of what may be of the one, to what may be of the other
+    assert all("USING COVERING INDEX" in line for line in related)
+    assert sum("pair (category_id=? AND other_category_id=? AND map_id=?" in line for line in related) == 1
+    assert all(line.endswith("(rowid=?)") for line in things)  # however many of a class there are
 
 
 @pytest.mark.parametrize(

@@ -328,6 +328,19 @@ def test_keyframes_of_before_are_as_they_were_seen(engine: Engine, empty_url: st
         kept = LandmarkParts(engine, map_id, 4).get("box", "a name")
         assert kept is not None
         assert kept["centre"].tolist() == [0, 1, 2]
+    relations = "SELECT landmark_id, kind, other_landmark_id, score, category_id, other_category_id, map_id "
+    relations += "FROM landmark_relations ORDER BY landmark_id, kind, other_landmark_id"
+    with engine.connect() as connection:
+        rows = connection.execute(text(relations)).all()
+    assert len(rows) == 5
+    assert {row.map_id for row in rows} == {map_id}
+    schema.downgrade(engine, "0018")
+    assert "category_id" not in {column["name"] for column in inspect(engine).get_columns("landmark_relations")}
+    schema.upgrade(engine)
+    with open_store(empty_url) as store:
+        with engine.connect() as connection:
+            assert connection.execute(text(relations)).all() == rows  # of before, as they are written now
+        assert len(find(store, "cup", on="dining table").hits) == 1
         store.delete_map(map_id)
     with engine.connect() as connection:
         for table in ("completed_categories", "map_completions", "landmark_parts"):
@@ -336,7 +349,13 @@ def test_keyframes_of_before_are_as_they_were_seen(engine: Engine, empty_url: st
 
 def test_upgrades_that_were_cut_off_go_on(engine: Engine) -> None:
     schema.upgrade(engine)
-    for revision, cut in (("0015", ""), ("0016", "DROP TABLE map_completions"), ("0016", ""), ("0017", "")):
+    for revision, cut in (
+        ("0015", ""),
+        ("0016", "DROP TABLE map_completions"),
+        ("0016", ""),
+        ("0017", ""),
+        ("0018", ""),
+    ):
         with engine.begin() as connection:
             connection.execute(text(f"UPDATE alembic_version SET version_num = '{revision}'"))
             if cut:
