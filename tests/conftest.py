@@ -12,6 +12,7 @@ from typing import NoReturn
 import pytest
 from hypothesis import HealthCheck, settings
 
+from tests import compiling
 from tests.mariadb import MARIADB
 from tests.mysql import MYSQL
 from tests.rooms import render
@@ -27,6 +28,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # how long examples take says more of the machine's load than of the code
 settings.register_profile("semdb", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("semdb")
+compiling.one_at_a_time()
 
 
 @pytest.fixture(scope="session")

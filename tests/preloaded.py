@@ -23,6 +23,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from tests import compiling
+
 REPOSITORY = Path(__file__).resolve().parent.parent
 MODULES = (
     "semdb.cli.main",
@@ -158,6 +160,7 @@ def _become(request: Mapping[str, Any], files: Sequence[int]) -> None:
 def _main() -> None:
     requests = socket.socket(fileno=int(sys.argv[1]))
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    compiling.one_at_a_time()
     main = importlib.import_module("semdb.cli.main")
     for module in MODULES:
         importlib.import_module(module)
