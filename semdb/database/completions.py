@@ -17,6 +17,7 @@ from semdb.database import retry
 from semdb.database.landmark_records import CompletedClass
 from semdb.database.records import ChangeKind
 from semdb.database.refinements import map_state_of
+from semdb.database.row_changes import write_groups
 from semdb.database.tables import (
     completed_categories,
     keyframe_categories,
@@ -76,12 +77,12 @@ def replace_completions(
         completed = ()  # the map may come to be so again, with keyframes of which these say nothing
     added = _complete(after, [(one.keyframe_id, category_ids[one.category], one.upper, one.lower) for one in completed])
     connection.execute(delete(map_completions).where(c.map_id == map_id))
-    connection.execute(delete(completed_categories).where(completed_categories.c.map_id == map_id))
+    rows = []
     if added:
         connection.execute(insert(map_completions), {"map_id": map_id, "map_state": state or ""})
         rows = [row for key in sorted(after) for row in _rows(map_id, key, after[key])]
-        for start in range(0, len(rows), CHUNK):
-            connection.execute(insert(completed_categories), rows[start : start + CHUNK])
+    stored = select(completed_categories).where(completed_categories.c.map_id == map_id)
+    write_groups(connection, completed_categories, "keyframe_id", stored, rows)
     changed = set(added)
     if before_state == state:  # who opened the map while this step was forgotten knows of none
         changed |= {key for key, found in before.items() if key in seen and found != seen[key]}

@@ -96,10 +96,12 @@ def unpack(kind: str, name: str, data: object) -> dict[str, npt.NDArray[Any]] | 
 class LandmarkParts:
     """The parts of a map, for one computation (`semdb.landmarks.memo.Memo`). Threads may share it.
 
-    Small ones are read when one of their kind is first asked for, all in one go; large ones (`LARGE`) one by one.
+    What all keyframes or landmarks ask for is read when one of its kind is first asked for, all in one go; large ones
+    (`LARGE`), and what few ask for (`FEW`), one by one.
     """
 
     LARGE = ("grid",)
+    FEW = ("points", "noise", "box", "visit")  # of what a landmark is made: of one that changed
     FIRST = ("lift", *LARGE)  # of a keyframe, of no use one without the other: stored before the others
 
     def __init__(self, engine: Engine, map_id: int, revision: int, *, empty: bool = False) -> None:
@@ -107,7 +109,7 @@ class LandmarkParts:
         self._revision = revision
         self._engine, self._map_id, self._empty = engine, map_id, empty
         self._known: dict[str, dict[str, Arrays]] = {}
-        self._large: dict[str, set[str]] = {}  # names of what is stored, by kind
+        self._large: dict[str, set[str]] = {}  # names of what is stored, by kind, of what is read one by one
         self._used: set[tuple[str, str]] = set()
         self._new: dict[tuple[str, str], bytes] = {}
         self._waiting = 0  # bytes of large ones that are not stored
@@ -122,17 +124,22 @@ class LandmarkParts:
                 return unpack(kind, name, self._new[kind, name])
             if self._empty:
                 return None
-            if kind not in self.LARGE:
+            if kind not in self.LARGE + self.FEW:
                 if kind not in self._known:
                     self._known[kind] = self._read(kind)
                 return self._known[kind].get(name)
+        if not self._is_stored(kind, name):
+            return None
         c = landmark_parts.c
         query = select(checked.up_to(c.data, MOST_BYTES)).where(self._mine, c.kind == kind, c.name == name)
         return unpack(kind, name, retry.read(self._engine, lambda connection: connection.execute(query).scalar()))
 
     def has(self, kind: str, name: str) -> bool:
-        """Whether a large one is stored under a name; it is not read."""
-        name, c = self._named(name), landmark_parts.c
+        """Whether one that is read alone is stored under a name; it is not read."""
+        return self._is_stored(kind, self._named(name))
+
+    def _is_stored(self, kind: str, name: str) -> bool:
+        c = landmark_parts.c
         with self._lock:
             if kind not in self._large and not self._empty:
                 query = select(c.name).where(self._mine, c.kind == kind)

@@ -10,7 +10,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
-from sqlalchemy import Connection, Engine, delete, insert, literal, select, update
+from sqlalchemy import Connection, Engine, Table, delete, insert, literal, select, update
 
 from semdb.database import checked, retry
 from semdb.database.codecs import encode_array
@@ -35,6 +35,7 @@ from semdb.database.landmark_tables import (
 )
 from semdb.database.reading import Bad, depth_scale_of, keyframe_heads
 from semdb.database.records import KeyframeHead
+from semdb.database.row_changes import delete_keys, insert_rows, update_rows, write_groups
 from semdb.database.tables import categories, keyframe_images, objects, recordings
 from semdb.errors import CodecError
 
@@ -147,10 +148,15 @@ def _height(row: Any, head: KeyframeHead) -> float:
 
 
 def replace_landmarks(connection: Connection, map_id: int, found: LandmarkSet, keep: Keep) -> int:
-    """Write the landmarks of a map in place of those that are there, within a transaction. Returns how many."""
+    """Make the landmarks of a map these, within a transaction; rows that stay as they are, are not written. How many.
+
+    Algorithms know no ids: `keep` says which landmark has that of one before.
+    """
     old = _landmark_of_objects(connection, map_id)
     kept = keep(old, [[s.object_id for s in row.sightings] for row in found.landmarks])
-    _delete_landmarks(connection, map_id)
+    c = landmarks.c
+    before = set(connection.execute(select(c.id).where(c.map_id == map_id)).scalars())
+    delete_keys(connection, landmarks, c.id, sorted(before - set(kept.ids)))
     names = {name for row in found.landmarks for name in (row.category, *row.perhaps)}
     names |= {item.category for item in found.completed}
     known = _category_ids(connection, sorted(names))
@@ -163,21 +169,31 @@ def replace_landmarks(connection: Connection, map_id: int, found: LandmarkSet, k
         else:
             ids.append(key)
             told.append({**values, "id": key})
-    _insert(connection, landmarks, told)
+    update_rows(connection, landmarks, select(landmarks).where(c.map_id == map_id), told)
+    for table, group, rows in _rows_beside(connection, map_id, found, ids, known):
+        stored = select(table).join(landmarks, c.id == table.c.landmark_id).where(c.map_id == map_id)
+        write_groups(connection, table, group, stored, rows)
+    _keep_merges(connection, map_id, {key: ids[number] for key, number in kept.merged.items()}, set(ids))
+    set_gravity(connection, map_id, found.gravity)
+    replace_completions(connection, map_id, found.completed, known)
+    return len(ids)
+
+
+def _rows_beside(
+    connection: Connection, map_id: int, found: LandmarkSet, ids: Sequence[int], known: Mapping[str, int]
+) -> list[tuple[Table, str, list[dict[str, Any]]]]:
+    """Tables of what belongs to landmarks, the column by which their rows belong together, and their rows."""
     numbered = list(zip(ids, found.landmarks, strict=True))
     sightings = [
         {"object_id": s.object_id, "landmark_id": key, "coverage": s.coverage, "visibility": s.visibility}
         for key, row in numbered
         for s in row.sightings
     ]
-    _insert(connection, landmark_sightings, sightings)
     views = [
         {"landmark_id": key, "place": k, "object_id": v.object_id, "quality": v.quality, "distance": v.distance}
         for key, row in numbered
         for k, v in enumerate(row.views)
     ]
-    _insert(connection, landmark_views, views)
-    _insert(connection, landmark_visits, _visit_rows(connection, map_id, numbered))
     relations = [
         {
             **{"landmark_id": ids[r.one], "kind": r.kind, "other_landmark_id": ids[r.other], "score": r.score},
@@ -186,17 +202,18 @@ def replace_landmarks(connection: Connection, map_id: int, found: LandmarkSet, k
         }
         for r in found.relations
     ]
-    _insert(connection, landmark_relations, relations)
     perhaps = [
         {"landmark_id": key, "category_id": known[name], "map_id": map_id, "probability": share}
         for key, row in numbered
         for name, share in sorted(row.perhaps.items())
     ]
-    _insert(connection, landmark_categories, perhaps)
-    _keep_merges(connection, map_id, {key: ids[number] for key, number in kept.merged.items()}, set(ids))
-    set_gravity(connection, map_id, found.gravity)
-    replace_completions(connection, map_id, found.completed, known)
-    return len(ids)
+    return [
+        (landmark_sightings, "object_id", sightings),
+        (landmark_views, "landmark_id", views),
+        (landmark_visits, "landmark_id", _visit_rows(connection, map_id, numbered)),
+        (landmark_relations, "landmark_id", relations),
+        (landmark_categories, "landmark_id", perhaps),
+    ]
 
 
 def _visit_rows(
@@ -225,13 +242,6 @@ def _landmark_of_objects(connection: Connection, map_id: int) -> dict[int, int]:
     s, m = landmark_sightings.c, landmarks.c
     query = select(s.object_id, s.landmark_id).join(landmarks, m.id == s.landmark_id).where(m.map_id == map_id)
     return {int(row.object_id): int(row.landmark_id) for row in connection.execute(query)}
-
-
-def _delete_landmarks(connection: Connection, map_id: int) -> None:
-    """Those of a map, with all that belongs to them, in statements of bounded size."""
-    c = landmarks.c
-    while keys := list(connection.execute(select(c.id).where(c.map_id == map_id).limit(CHUNK)).scalars()):
-        connection.execute(delete(landmarks).where(c.id.in_(keys)))
 
 
 def _category_ids(connection: Connection, names: Sequence[str]) -> dict[str, int]:
@@ -264,11 +274,6 @@ def _values(row: LandmarkRow) -> dict[str, Any]:
     }
 
 
-def _insert(connection: Connection, table: Any, rows: Sequence[Mapping[str, Any]]) -> None:
-    for start in range(0, len(rows), CHUNK):
-        connection.execute(insert(table), list(rows[start : start + CHUNK]))
-
-
 def _keep_merges(connection: Connection, map_id: int, merged: Mapping[int, int], there: set[int]) -> None:
     """Adds what was merged now; what had been merged into one of those follows it."""
     c = landmark_merges.c
@@ -281,7 +286,7 @@ def _keep_merges(connection: Connection, map_id: int, merged: Mapping[int, int],
     for key in sorted(there & set(known)):
         connection.execute(delete(landmark_merges).where(c.landmark_id == key))
     new = [{"landmark_id": key, "map_id": map_id, "merged_into": merged[key]} for key in sorted(merged)]
-    _insert(connection, landmark_merges, [row for row in new if row["landmark_id"] not in known])
+    insert_rows(connection, landmark_merges, [row for row in new if row["landmark_id"] not in known])
 
 
 def set_gravity(connection: Connection, map_id: int, gravity: GravityRow) -> None:

@@ -24,6 +24,7 @@ from semdb.database.records import ClassConfusion, MapObject, Refinement
 from semdb.database.tables import categories, class_confusions, keyframes, maps, objects, recordings, refinements
 from semdb.errors import CodecError, NotFoundError
 from semdb.geometry import FARTHEST_POSE_M
+from semdb.types import FloatArray
 
 CLASSES, POINTS = "classes", "points"  # kinds: steps of `semdb refine`
 FRAMES = "frames"  # none: says when frames beside keyframes were last written, to programs that keep a map
@@ -180,7 +181,7 @@ def iter_objects(
             found.setdefault(row.keyframe_id, []).append(row)
         for place, key in enumerate(ids, start):
             try:
-                yield from [_map_object(place, row) for row in found.get(key, ())]
+                yield from _map_objects(place, found.get(key, ()))
             except CodecError as error:
                 if bad is None:
                     raise
@@ -193,7 +194,15 @@ def _rows(engine: Engine, query: Select[Any]) -> list[Any]:
     return retry.read(engine, lambda connection: list(connection.execute(query)))
 
 
-def _map_object(keyframe: int, row: Any) -> MapObject:
+def _map_objects(keyframe: int, rows: Sequence[Any]) -> list[MapObject]:
+    """The objects of one keyframe."""
+    if not rows:
+        return []
+    pose = pose_of([getattr(rows[0], name) for name in POSE_COLUMNS], f"keyframe {rows[0].keyframe_id}")
+    return [_map_object(keyframe, pose, row) for row in rows]
+
+
+def _map_object(keyframe: int, world_from_camera: FloatArray, row: Any) -> MapObject:
     where = f"of an object of keyframe {row.keyframe_id}"
 
     def place(name: str) -> tuple[float, float, float]:
@@ -205,7 +214,7 @@ def _map_object(keyframe: int, row: Any) -> MapObject:
         keyframe=keyframe,
         category=checked.text(row.name, f"categories.name {where}"),
         score=checked.real(row.score, f"objects.score {where}", 0.0, 1.0),
-        world_from_camera=pose_of([getattr(row, name) for name in POSE_COLUMNS], f"keyframe {row.keyframe_id}"),
+        world_from_camera=world_from_camera,
         centroid=place("centroid"),
         extent=place("extent"),
     )

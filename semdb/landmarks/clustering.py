@@ -11,6 +11,8 @@ import heapq
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from semdb.types import Int64Array
 
@@ -20,16 +22,42 @@ UNIT = 1000  # of a weight
 def clusters(count: int, a: Int64Array, b: Int64Array, weight: Int64Array) -> Int64Array:
     """The cluster of each of `count` nodes, int64 ``[count]``: the smallest node of it.
 
-    Edges ``a[k]``, ``b[k]`` have whole weights, positive ones for being one; several of one pair are added.
+    Edges ``a[k]``, ``b[k]`` have whole weights, positive ones for being one; several of one pair are added. What no
+    positive edges join is never joined, so each part that they join is cut for itself; one without an edge that is
+    negative is one cluster.
     """
-    joined = contract(range(count), a.tolist(), b.tolist(), weight.tolist())
-    found = np.arange(count, dtype=np.int64)
-    for node in range(count):
-        root = node
-        while joined[root] != root:
-            root = joined[root]
-        found[node] = root
+    low, high = np.minimum(a, b), np.maximum(a, b)
+    pairs, place = np.unique(low * max(count, 1) + high, return_inverse=True)
+    total = np.zeros(len(pairs), np.int64)
+    np.add.at(total, place, weight)
+    low, high = np.divmod(pairs, max(count, 1))
+    low, high, total = (values[low != high] for values in (low, high, total))
+    part = _parts(count, low[total > 0], high[total > 0])
+    inside = part[low] == part[high]
+    low, high, total = low[inside], high[inside], total[inside]
+    found = part.copy()
+    torn = np.unique(part[low[total < 0]])
+    chosen = np.isin(part[low], torn)
+    low, high, total = low[chosen], high[chosen], total[chosen]
+    order = np.argsort(part[low], kind="stable")
+    ends = np.searchsorted(part[low][order], torn, side="right").tolist()
+    start = 0
+    for end in ends:
+        edges = order[start:end]
+        start = end
+        nodes = np.unique(np.concatenate([low[edges], high[edges]])).tolist()
+        joined = contract(nodes, low[edges].tolist(), high[edges].tolist(), total[edges].tolist())
+        for node in nodes:  # ascending: the one that it was joined to has its own already
+            found[node] = node if joined[node] == node else found[joined[node]]
     return found
+
+
+def _parts(count: int, a: Int64Array, b: Int64Array) -> Int64Array:
+    """Of each node the smallest one that edges join it to, int64 ``[count]``."""
+    graph = coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(count, count))
+    label = connected_components(graph, directed=False)[1] if count else np.empty(0, np.int64)
+    first = np.unique(label, return_index=True)[1]
+    return np.asarray(first[label], np.int64)
 
 
 def contract(nodes: Sequence[int], a: Sequence[int], b: Sequence[int], weight: Sequence[int]) -> dict[int, int]:

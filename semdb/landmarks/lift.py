@@ -62,6 +62,7 @@ class LiftedKeyframe:
     single: (
         FloatArray  # [sightings] share of the outline whose depth is that of one pixel, and of no plane through some
     )
+    farthest: float  # metres: the largest depth of the grid; what lies beyond is hidden
     apart: float = 0.0  # metres, a deviation: how far its surfaces lie off those of its neighbours
     name: str = ""  # of all that it was made from, but for its pose (see `memo`)
     key: str = ""  # of that, the pose and `apart`
@@ -157,6 +158,7 @@ def lift_keyframe(
         step=step,
         noise=noise,
         single=single,
+        farthest=float(grids.depth.max(initial=0.0)),
     )
 
 

@@ -27,6 +27,9 @@ class Memo(Protocol):
     def put(self, kind: str, name: str, arrays: Arrays) -> None:
         """Remembers `arrays` under a name, in place of what is there."""
 
+    def keep(self, kind: str, name: str) -> None:
+        """What is remembered under a name is of use, whether or not it is asked for."""
+
 
 class Forgetful:
     """Remembers nothing."""
@@ -36,6 +39,27 @@ class Forgetful:
 
     def put(self, kind: str, name: str, arrays: Arrays) -> None:
         pass
+
+    def keep(self, kind: str, name: str) -> None:
+        pass
+
+
+class Noting:
+    """A memo that notes what it is asked for: (kind, name)."""
+
+    def __init__(self, memo: Memo) -> None:
+        self._memo = memo
+        self.asked: list[tuple[str, str]] = []
+
+    def get(self, kind: str, name: str) -> Arrays | None:
+        self.asked.append((kind, name))
+        return self._memo.get(kind, name)
+
+    def put(self, kind: str, name: str, arrays: Arrays) -> None:
+        self._memo.put(kind, name, arrays)
+
+    def keep(self, kind: str, name: str) -> None:
+        self._memo.keep(kind, name)
 
 
 def name_of(*parts: object) -> str:

@@ -80,6 +80,11 @@ class _Standing:
     sigma: float
     category: str
 
+    @property
+    def values(self) -> list[float]:
+        """All of it in numbers but the class."""
+        return [*self.ground.ravel().tolist(), self.low, self.high, self.area, self.sigma]
+
 
 def find_relations(
     landmarks: Sequence[Landmark],
@@ -97,16 +102,15 @@ def find_relations(
     standing = {k: _standing(landmarks[k], names, axes) for k in there}
     centres = np.array([landmarks[k].box.centre for k in there])
     halves = np.array([float(np.linalg.norm(landmarks[k].box.size)) / 2 for k in there])
+    pairs = cKDTree(centres).query_pairs(2 * float(halves.max()) + REACH_M, output_type="ndarray")
+    one, other = pairs.min(axis=1), pairs.max(axis=1)
+    apart = np.linalg.norm(centres[one] - centres[other], axis=1) - halves[one] - halves[other]
+    one, other = one[apart <= REACH_M], other[apart <= REACH_M]
+    order = np.lexsort((other, one))
+    numbers, ends = np.array(there)[other[order]], np.searchsorted(one[order], np.arange(len(there)), side="right")
     found: list[Related] = []
-    tree = cKDTree(centres)
-    for row, k in enumerate(there):
-        near = tree.query_ball_point(centres[row], halves[row] + float(halves.max()) + REACH_M)
-        others = []
-        for other in sorted(near):
-            apart = float(np.linalg.norm(centres[row] - centres[other])) - halves[row] - halves[other]
-            if other > row and apart <= REACH_M:
-                others.append(there[other])
-        found += _related(k, others, standing, floor_score, memo)
+    for k, start, end in zip(there, [0, *ends.tolist()], ends.tolist(), strict=False):
+        found += _related(k, numbers[start:end].tolist(), standing, floor_score, memo)
     return sorted(found, key=lambda item: (item.one, item.other, item.kind))
 
 
@@ -127,17 +131,14 @@ def _related(
 
     if not others:
         return []
-    name = name_of(least, [_values(standing[number]) for number in (k, *others)])
+    of_all = [standing[number] for number in (k, *others)]
+    name = name_of(least, np.array([one.values for one in of_all]), "\n".join(one.category for one in of_all))
     kept = remembered(memo, RELATED, name, compute)
     numbers, kinds = (k, *others), list(Relation)
     return [
         Related(numbers[a], kinds[kind], numbers[b], score)
         for (a, kind, b), score in zip(kept["rows"].tolist(), kept["score"].tolist(), strict=True)
     ]
-
-
-def _values(one: _Standing) -> tuple[object, ...]:
-    return one.ground, one.low, one.high, one.area, one.sigma, one.category
 
 
 def _standing(thing: Landmark, names: Sequence[str], axes: FloatArray) -> _Standing:

@@ -25,7 +25,7 @@ def lift_arrays(lifted: LiftedKeyframe, colours: Float32Array | None) -> dict[st
         "beside": lifted.beside,
         "cut": lifted.cut,
         "single": lifted.single,
-        "numbers": np.array([lifted.step, lifted.noise], np.float64),
+        "numbers": np.array([lifted.step, lifted.noise, lifted.farthest], np.float64),
     }
     if colours is not None:
         small["colours"] = colours
@@ -37,7 +37,7 @@ def lifted_from(
     camera: Camera, world_from_camera: FloatArray, name: str, small: Arrays, grids: Callable[[], Grids]
 ) -> tuple[LiftedKeyframe, Float32Array | None]:
     """A keyframe as it was lifted, and its colours; `grids` gives what is large when it is asked for."""
-    step, noise = small["numbers"].tolist()
+    step, noise, farthest = small["numbers"].tolist()
     lifted = LiftedKeyframe(
         camera=camera,
         world_from_camera=np.asarray(world_from_camera, np.float64),
@@ -50,6 +50,7 @@ def lifted_from(
         step=int(step),
         noise=noise,
         single=small["single"],
+        farthest=farthest,
         name=name,
     )
     return lifted, small.get("colours")

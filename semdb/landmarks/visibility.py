@@ -11,7 +11,7 @@ import numpy as np
 
 from semdb.geometry import invert_pose, transform_points
 from semdb.landmarks.lift import LiftedKeyframe
-from semdb.landmarks.looked import Looked
+from semdb.landmarks.looked import Looked, Reach
 from semdb.landmarks.memo import Memo
 from semdb.landmarks.options import SeeOptions
 from semdb.threads import cores, each
@@ -84,16 +84,18 @@ def look(
     progress: Callable[[int, int], None] | None = None,
     memo: Memo | None = None,
 ) -> Views:
-    """Looks every sighting up in every keyframe that may have it in view."""
+    """Looks every sighting up in every keyframe that may have it in view, and not beyond all that it measured."""
+    reach = Reach(lifted, sightings.keyframe, (sightings.centre, sightings.radius), see)
     known = None
     if memo is not None and all(frame.name for frame in lifted):
-        known = Looked(lifted, sightings.keyframe, (sightings.centre, sightings.radius), see, memo)
-    everything = np.arange(len(sightings), dtype=np.int64)
+        known = Looked(lifted, sightings.keyframe, see, memo)
 
     def one(number: int) -> tuple[np.ndarray, ...]:
-        if known is None:
-            return _look_in(number, lifted[number], sightings, everything, see)
-        return known.look_in(number, lambda chosen: _look_in(number, lifted[number], sightings, chosen, see))
+        def compute(chosen: Int64Array) -> tuple[np.ndarray, ...]:
+            return _look_in(number, lifted[number], sightings, chosen, see)
+
+        within = reach.of(number)
+        return compute(within) if known is None else known.look_in(number, within, compute)
 
     parts: list[tuple[np.ndarray, ...]] = []
     for start in range(0, len(lifted), _AT_ONCE):

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 CLOCK_NS = 10**17  # times from here on (1973) are of the clock on the wall; smaller ones begin with their recording
 LEAST_EVIDENCE = 0.0005
-REVISION = 5  # of the computation: another one makes what is stored out of date
+REVISION = 6  # of the computation: another one makes what is stored out of date
 
 
 @dataclass(frozen=True, slots=True)

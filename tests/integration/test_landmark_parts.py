@@ -91,7 +91,10 @@ def test_only_what_changed_is_computed_and_contents_are_the_same(
 DAMAGES = ("x", "substr(data, 1, 40)", "substr(data, 1, length(data) - 3)")
 
 
-@pytest.mark.parametrize("kinds", ["'lift', 'look', 'box', 'poses'", "'grid', 'points'", "'surface', 'noise', 'visit'"])
+@pytest.mark.parametrize(
+    "kinds",
+    ["'lift', 'look', 'thing', 'box', 'poses'", "'grid', 'thing', 'points'", "'surface', 'noise', 'thing', 'visit'"],
+)
 def test_damaged_parts_are_computed_anew(store: Store, reference: dict[int, list[object]], kinds: str) -> None:
     info = ingest(store, range(1, 6), spoiled=True)
     refine(store, info)

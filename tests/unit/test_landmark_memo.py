@@ -35,6 +35,9 @@ class Remembered:
     def put(self, kind: str, name: str, arrays: Arrays) -> None:
         self.arrays[kind, name] = arrays
 
+    def keep(self, kind: str, name: str) -> None:
+        assert (kind, name) in self.arrays
+
 
 @lru_cache(maxsize=1)
 def keyframes() -> tuple[SeenKeyframe, ...]:

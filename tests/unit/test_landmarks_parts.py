@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from semdb.geometry import so3_exp
 from semdb.geometry.sensor import depth_noise
 from semdb.landmarks.boxes import Box, intersection_over_union, shared_area, upright_axes, upright_box
-from semdb.landmarks.clustering import clusters
+from semdb.landmarks.clustering import clusters, contract
 from semdb.landmarks.evidence import fuse, name_probabilities
 from semdb.landmarks.kernels import joined_pixels
 from semdb.landmarks.lift import SeenObject, apart, lift_keyframe, measured_noise, same_masks
@@ -192,3 +192,17 @@ def test_surfaces_are_followed_to_the_last_pixel() -> None:
     reached[out[:number]] = True
     assert reached.reshape(20, 30)[5, 15:25].all()
     assert number == 110 - 5
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 10**6))
+def test_parts_are_cut_each_for_itself_as_the_whole_is(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    count, edges = int(rng.integers(1, 24)), int(rng.integers(0, 60))
+    a, b = rng.integers(0, count, (2, edges))
+    weight = rng.integers(-4, 5, edges)
+    kept = contract(range(count), a.tolist(), b.tolist(), weight.tolist())
+    expected = np.arange(count)
+    for node in range(count):
+        expected[node] = node if kept[node] == node else expected[kept[node]]
+    np.testing.assert_array_equal(clusters(count, a, b, weight), expected)

@@ -1,0 +1,63 @@
+"""Rows in place of those that are there, of which only what differs is written: the rest stays as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from sqlalchemy import Connection, Select, Table, bindparam, delete, insert, update
+from sqlalchemy.sql.elements import ColumnElement
+
+CHUNK = 500  # rows of a statement
+Rows = Sequence[Mapping[str, Any]]
+
+
+def write_groups(connection: Connection, table: Table, group: str, stored: Select[Any], wanted: Rows) -> None:
+    """Makes the rows of `table` that `stored` selects (all columns) those of `wanted`.
+
+    Rows belong together by the column `group`: where one of a group differs, all of it are written anew.
+    """
+    names = [column.name for column in table.columns]
+    there, new = _grouped(connection.execute(stored), names, group), _grouped(wanted, names, group)
+    changed = {key for key in there.keys() | new.keys() if _sorted(there.get(key)) != _sorted(new.get(key))}
+    delete_keys(connection, table, table.c[group], sorted(changed & there.keys()))
+    rows = [dict(zip(names, row, strict=True)) for key in sorted(changed & new.keys()) for row in new[key]]
+    insert_rows(connection, table, rows)
+
+
+def update_rows(connection: Connection, table: Table, stored: Select[Any], wanted: Rows) -> None:
+    """Makes the rows of `table` with these ids, which `stored` selects (all columns), those of `wanted`."""
+    names = [column.name for column in table.columns]
+    there = {row.id: tuple(row) for row in connection.execute(stored)}
+    changed = [row for row in wanted if there.get(row["id"]) != tuple(row[name] for name in names)]
+    if changed:
+        others = [name for name in names if name != "id"]
+        query = update(table).where(table.c.id == bindparam("of_id"))
+        query = query.values({name: bindparam(f"to_{name}") for name in others})
+        values = [{"of_id": row["id"], **{f"to_{name}": row[name] for name in others}} for row in changed]
+        for start in range(0, len(values), CHUNK):
+            connection.execute(query, values[start : start + CHUNK])
+
+
+def delete_keys(connection: Connection, table: Table, column: ColumnElement[Any], keys: Sequence[Any]) -> None:
+    """Deletes the rows of `table` with these values of `column`, in statements of bounded size."""
+    for start in range(0, len(keys), CHUNK):
+        connection.execute(delete(table).where(column.in_(keys[start : start + CHUNK])))
+
+
+def insert_rows(connection: Connection, table: Table, rows: Rows) -> None:
+    """Inserts rows, in statements of bounded size."""
+    for start in range(0, len(rows), CHUNK):
+        connection.execute(insert(table), list(rows[start : start + CHUNK]))
+
+
+def _grouped(rows: Any, names: Sequence[str], group: str) -> dict[Any, list[tuple[Any, ...]]]:
+    found: dict[Any, list[tuple[Any, ...]]] = {}
+    for row in rows:
+        values = row if isinstance(row, Mapping) else row._mapping
+        found.setdefault(values[group], []).append(tuple(values[name] for name in names))
+    return found
+
+
+def _sorted(rows: list[tuple[Any, ...]] | None) -> list[tuple[Any, ...]]:
+    return sorted(rows or [], key=repr)
