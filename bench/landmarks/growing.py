@@ -1,17 +1,21 @@
 """What it costs to compute landmarks of a large map, and to compute them again after keyframes were added.
 
-``python -m bench.landmarks.growing [--rooms 20] [--keyframes 50] [--added 2] [--width 640] [--noise] [--spread]
-[--json FILE]``. A building of
+``python -m bench.landmarks.growing [--rooms 20] [--keyframes 50] [--added 2] [--width 640] [--found 1] [--noise]
+[--spread] [--rendered FOLDER] [--json FILE]``. A building of
 rooms 25 m apart, of `--keyframes` each: two rooms are rendered, and stand there again and again. Landmarks are
 computed of all rooms but the last `--added`, then of all with what is remembered, then of all from nothing, which has
 to give the same to the last bit. Times are of the processor, and as multiples of reading all rows. `--spread` adds as
-many keyframes to every room instead: then every room has changed. Needs no model file.
+many keyframes to every room instead: then every room has changed. `--found` is the share of the objects that the
+detector finds, `--rendered` keeps what was rendered for the next time. Needs no model file.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
+import pickle
+import resource
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -48,10 +52,13 @@ class Growth:
     added: int
     objects: int
     landmarks: int
+    cores: int
+    memory_mib: int  # of the process, at most, beyond what it has of rendered rooms
     reading: float  # all rows
     before: float  # without what is added
     after: float  # with it, and with what is remembered
     whole: float  # from nothing
+    seconds: dict[str, float]  # on the wall, of before, after and whole
     stored_bytes: int  # that are remembered
     same: bool  # contents, bit for bit
 
@@ -92,11 +99,38 @@ def store_room(
         store.write_keyframe(recording, replace(records[index], world_from_camera=pose))
 
 
-def spent(work: Callable[[], object]) -> float:
-    """Processor time of `work`, seconds."""
-    start = time.process_time()
+def kept_records(seed: int, keyframes: int, width: int, folder: Path | None, *, noise: bool) -> list[KeyframeRecord]:
+    """As `room_records`; rendered once where there is a `folder`."""
+    if folder is None:
+        return room_records(seed, keyframes, width, noise=noise)
+    path = folder / f"room-{seed}-{keyframes}-{width}-{int(noise)}.pickle"
+    if not path.exists():
+        path.write_bytes(pickle.dumps(room_records(seed, keyframes, width, noise=noise)))
+    found: list[KeyframeRecord] = pickle.loads(path.read_bytes())
+    return found
+
+
+def with_found(records: Sequence[KeyframeRecord], share: float) -> list[KeyframeRecord]:
+    """The keyframes with so large a share of their objects."""
+    thinned = []
+    for record in records:
+        made, rng = record.description, np.random.default_rng([record.frame_index, 23])
+        kept = np.flatnonzero(rng.random(len(made.detections)) < share).tolist()
+        detections, geometry = (tuple(part[k] for k in kept) for part in (made.detections, made.geometry))
+        thinned.append(
+            replace(record, description=replace(made, detections=detections, geometry=geometry, sightings=None))
+        )
+    return thinned
+
+
+def spent(work: Callable[[], object], what: str, seconds: dict[str, float]) -> float:
+    """Processor time of `work`, seconds; those on the wall are noted."""
+    start, wall = time.process_time(), time.perf_counter()
     work()
-    return time.process_time() - start
+    seconds[what] = time.perf_counter() - wall
+    taken = time.process_time() - start
+    print(f"{what}: {taken:.1f} s of the processor, {seconds[what]:.1f} s on the wall", flush=True)
+    return taken
 
 
 def contents(store: Store) -> list[tuple[object, ...]]:
@@ -108,9 +142,14 @@ def contents(store: Store) -> list[tuple[object, ...]]:
         return sorted((tuple(row) for row in rows), key=repr)
 
 
-def measure(rooms: int, keyframes: int, added: int, width: int, *, noise: bool, spread: bool) -> Growth:
+def measure(given: argparse.Namespace) -> Growth:
     """One building, on SQLite."""
-    records = [room_records(seed, keyframes, width, noise=noise) for seed in ROOMS]
+    rooms, keyframes, added, spread = int(given.rooms), int(given.keyframes), int(given.added), bool(given.spread)
+    records = [
+        with_found(kept_records(seed, keyframes, given.width, given.rendered, noise=given.noise), given.found)
+        for seed in ROOMS
+    ]
+    seconds: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as folder, open_store(f"sqlite:///{folder}/m.sqlite3", create=True) as store:
         map_id = store.ensure_map("building")
         everything = list(range(keyframes))
@@ -120,21 +159,34 @@ def measure(rooms: int, keyframes: int, added: int, width: int, *, noise: bool, 
             store_room(store, map_id, number, records[number % 2], [k for k in everything if k not in late])
         info = store.find_map("building")
         refine_map(store, store.find_map("building"), kinds=["classes"])
-        before = spent(lambda: refine_map(store, info, kinds=[LANDMARKS]))
+        rendered = resident_mib()
+        before = spent(lambda: refine_map(store, info, kinds=[LANDMARKS]), "before", seconds)
         for number in range(total):
             if number >= rooms or spread:
                 store_room(store, map_id, number, records[number % 2], late if spread else everything)
-        after = spent(lambda: refine_map(store, info, kinds=[LANDMARKS]))
+        after = spent(lambda: refine_map(store, info, kinds=[LANDMARKS]), "after", seconds)
         found = contents(store)
         with store.engine.connect() as connection:
             stored = int(connection.execute(text("SELECT SUM(size) FROM landmark_parts")).scalar() or 0)
-        whole = spent(lambda: refine_map(store, info, kinds=[LANDMARKS], force=True))
-        reading = spent(lambda: list(landmark_rows.iter_keyframe_depths(store.engine, map_id)))
+        whole = spent(lambda: refine_map(store, info, kinds=[LANDMARKS], force=True), "whole", seconds)
+        reading = spent(lambda: _read(store, map_id), "reading", seconds)
         objects = sum(len(r.description.detections) for n in range(total) for r in records[n % 2])
         count = store.keyframe_count(map_id)
         new = count - rooms * (keyframes - len(late))
         same = contents(store) == found
-        return Growth(count, new, objects, len(found), reading, before, after, whole, stored, same)
+        memory = max(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024 - rendered, 0)
+        sizes = (count, new, objects, len(found), len(os.sched_getaffinity(0)), memory)
+        return Growth(*sizes, reading, before, after, whole, seconds, stored, same)
+
+
+def resident_mib() -> int:
+    """Memory of this process."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") // 2**20
+
+
+def _read(store: Store, map_id: int) -> None:
+    for _ in landmark_rows.iter_keyframe_depths(store.engine, map_id):
+        pass
 
 
 def main() -> None:
@@ -145,15 +197,18 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=640)
     parser.add_argument("--noise", action="store_true", help="noisy depth, 30 %% missed, 15 %% misnamed")
     parser.add_argument("--spread", action="store_true", help="what is added is of all rooms")
+    parser.add_argument("--found", type=float, default=1.0, help="share of the objects that the detector finds")
+    parser.add_argument("--rendered", type=Path, help="folder that keeps what is rendered")
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
-    found = measure(given.rooms, given.keyframes, given.added, given.width, noise=given.noise, spread=given.spread)
+    found = measure(given)
     of_map = f"{found.keyframes} keyframes, {found.added} of them added, {found.objects} objects"
     print(f"{of_map}, {found.landmarks} landmarks")
     for name in ("reading", "before", "after", "whole"):
         seconds = getattr(found, name)
         shares = f"{seconds / found.reading:8.1f} times reading{seconds / found.whole:8.3f} of the whole"
         print(f"{name:10}{seconds:8.1f} s of one core{shares}")
+    print(f"{found.cores} cores, {found.memory_mib} MiB of memory at most beyond rendered rooms")
     print(
         f"remembered {found.stored_bytes / 2**20:.0f} MiB; contents are {'the same' if found.same else 'NOT THE SAME'}"
     )

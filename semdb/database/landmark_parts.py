@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import json
+import math
 import struct
 import threading
 from collections.abc import Mapping, Sequence
@@ -86,7 +87,7 @@ def unpack(kind: str, name: str, data: object) -> dict[str, npt.NDArray[Any]] | 
         return None
     found, start = {}, described
     for key, dtype, shape in listed:
-        number = int(np.prod(shape, dtype=np.int64))
+        number = math.prod(shape)
         # a copy, so that it lies where kernels want it, and may be written
         found[key] = np.frombuffer(content, np.dtype(dtype), number, start).reshape(shape).copy()
         start += found[key].nbytes

@@ -10,6 +10,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 from sqlalchemy import BigInteger, Connection, Engine, Select, case, cast, delete, func, insert, select, update
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.sql.elements import ColumnElement
@@ -29,6 +30,7 @@ from semdb.types import FloatArray
 CLASSES, POINTS = "classes", "points"  # kinds: steps of `semdb refine`
 FRAMES = "frames"  # none: says when frames beside keyframes were last written, to programs that keep a map
 CHUNK = 500
+PLACE_COLUMNS = 6  # of an object: centroid and extent
 WRITE_CHUNK = 2000
 MICRO = 1_000_000
 Progress = Callable[[int, int], None]
@@ -199,7 +201,15 @@ def _map_objects(keyframe: int, rows: Sequence[Any]) -> list[MapObject]:
     if not rows:
         return []
     pose = pose_of([getattr(rows[0], name) for name in POSE_COLUMNS], f"keyframe {rows[0].keyframe_id}")
-    return [_map_object(keyframe, pose, row) for row in rows]
+    numbers = checked.numbers_of([tuple(row)[-PLACE_COLUMNS:] for row in rows], PLACE_COLUMNS)
+    if not (np.abs(numbers) <= FARTHEST_POINT_M).all():
+        return [_map_object(keyframe, pose, row) for row in rows]  # raises for the one that is none
+    found = []
+    for row, (x, y, z, *extent) in zip(rows, numbers.tolist(), strict=True):
+        name = checked.text(row.name, f"categories.name of an object of keyframe {row.keyframe_id}")
+        score = checked.real(row.score, f"objects.score of an object of keyframe {row.keyframe_id}", 0.0, 1.0)
+        found.append(MapObject(keyframe, name, score, pose, (x, y, z), (extent[0], extent[1], extent[2])))
+    return found
 
 
 def _map_object(keyframe: int, world_from_camera: FloatArray, row: Any) -> MapObject:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from sqlalchemy import Connection, Select, Table, bindparam, delete, insert, update
@@ -18,8 +18,9 @@ def write_groups(connection: Connection, table: Table, group: str, stored: Selec
     Rows belong together by the column `group`: where one of a group differs, all of it are written anew.
     """
     names = [column.name for column in table.columns]
-    there, new = _grouped(connection.execute(stored), names, group), _grouped(wanted, names, group)
-    changed = {key for key in there.keys() | new.keys() if _sorted(there.get(key)) != _sorted(new.get(key))}
+    there = _grouped(map(tuple, connection.execute(stored)), names.index(group))
+    new = _grouped((tuple(row[name] for name in names) for row in wanted), names.index(group))
+    changed = {key for key in there.keys() | new.keys() if set(there.get(key, ())) != set(new.get(key, ()))}
     delete_keys(connection, table, table.c[group], sorted(changed & there.keys()))
     rows = [dict(zip(names, row, strict=True)) for key in sorted(changed & new.keys()) for row in new[key]]
     insert_rows(connection, table, rows)
@@ -51,13 +52,8 @@ def insert_rows(connection: Connection, table: Table, rows: Rows) -> None:
         connection.execute(insert(table), list(rows[start : start + CHUNK]))
 
 
-def _grouped(rows: Any, names: Sequence[str], group: str) -> dict[Any, list[tuple[Any, ...]]]:
+def _grouped(rows: Iterable[tuple[Any, ...]], column: int) -> dict[Any, list[tuple[Any, ...]]]:
     found: dict[Any, list[tuple[Any, ...]]] = {}
     for row in rows:
-        values = row if isinstance(row, Mapping) else row._mapping
-        found.setdefault(values[group], []).append(tuple(values[name] for name in names))
+        found.setdefault(row[column], []).append(row)
     return found
-
-
-def _sorted(rows: list[tuple[Any, ...]] | None) -> list[tuple[Any, ...]]:
-    return sorted(rows or [], key=repr)
