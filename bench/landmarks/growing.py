@@ -33,12 +33,13 @@ from semdb.perception.describe import Describer
 from semdb.perception.detectors.recorded import RecordedDetector
 from semdb.perception.encoders.gist import GistEncoder
 from semdb.perception.features import load_features
+from semdb.perception.objects import take_features
 from semdb.recordings.images import encode_16bit
 from semdb.recordings.synthetic import SyntheticOptions, SyntheticSequence
 from semdb.refinement.run import refine_map
 from semdb.refinement.steps import LANDMARKS
 from semdb.settings import Settings
-from semdb.types import InstanceMasks
+from semdb.types import InstanceMasks, Keypoints
 
 APART_M = 25.0
 ROOMS = (302, 303)  # seeds
@@ -117,9 +118,14 @@ def with_found(records: Sequence[KeyframeRecord], share: float) -> list[Keyframe
         made, rng = record.description, np.random.default_rng([record.frame_index, 23])
         kept = np.flatnonzero(rng.random(len(made.detections)) < share).tolist()
         detections, geometry = (tuple(part[k] for k in kept) for part in (made.detections, made.geometry))
-        thinned.append(
-            replace(record, description=replace(made, detections=detections, geometry=geometry, sightings=None))
-        )
+        number = np.full(len(made.detections) + 1, -1, np.int32)  # the last: of the background
+        number[kept] = np.arange(len(kept))
+        index = number[made.keypoints.object_index]
+        order = np.argsort(np.where(index < 0, len(kept), index), kind="stable")
+        points = made.keypoints
+        keypoints = Keypoints(take_features(points.features, order), index[order], points.points[order])
+        found = replace(made, detections=detections, geometry=geometry, keypoints=keypoints, sightings=None)
+        thinned.append(replace(record, description=found))
     return thinned
 
 

@@ -66,7 +66,7 @@ class Assembly:
         roots, start = np.unique(cluster[order], return_index=True)
         ends = [*start[1:].tolist(), len(order)][: len(roots)]
         self._rows = {int(r): order[s:e] for r, s, e in zip(roots, start, ends, strict=True)}
-        self._views = views
+        self._views, self._cluster = views, cluster
         self._recordings = [frame.recording for frame in keyframes]
         self._recording = np.array(self._recordings, np.int64)
         self._time = np.array([NO_TIME if frame.time_ns is None else frame.time_ns for frame in keyframes], np.int64)
@@ -138,7 +138,7 @@ class Assembly:
         evidence = fuse(category, score, self._names)
         best = int(np.argmax(np.round(evidence, 9)))
         around = self._around(rows, members)
-        name = self._name(around, members, score)
+        name = self._name(around, members, rows, score)
         found = None if name is None else self._memo.get(THING, name)
         if found is None:
             noting = Noting(self._memo)
@@ -160,7 +160,9 @@ class Assembly:
         recordings, recording = np.unique(self._recording[keyframes], return_inverse=True)
         return Around(keyframes, candidates, recordings, recording)
 
-    def _name(self, around: Around, members: Mapping[int, Sequence[int]], score: FloatArray) -> str | None:
+    def _name(
+        self, around: Around, members: Mapping[int, Sequence[int]], rows: Int64Array, score: FloatArray
+    ) -> str | None:
         """Of all that a thing is made from, but what its sightings are called; None where keyframes have no name."""
         if self._keys is None:
             return None
@@ -175,6 +177,7 @@ class Assembly:
             rank(around.candidates),
             rank(np.array([k for k, numbers in sorted(members.items()) for _ in numbers], np.int64)),
             np.array([one for _, numbers in sorted(members.items()) for one in sorted(numbers)], np.int64),
+            np.unique(self._cluster[rows], return_inverse=True)[1],  # several, where those at one place were made one
             score,
         )
 

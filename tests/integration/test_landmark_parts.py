@@ -9,8 +9,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from isal import isal_zlib
-from sqlalchemy import Connection, Engine, text
+from sqlalchemy import Connection, Engine, event, text
 
+from semdb import threads
 from semdb.database import copying_landmarks, landmark_parts, retry
 from semdb.database.copying import copy_map
 from semdb.database.ids import SharedIds
@@ -42,6 +43,18 @@ def asked_for(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, bool]]:
     return asked
 
 
+def changes_of(store: Store) -> list[str]:
+    """What is written from now on."""
+    written: list[str] = []
+
+    def noted(_: object, __: object, statement: str, *___: object) -> None:
+        if statement.startswith(("INSERT", "UPDATE", "DELETE")) and "refinements" not in statement:
+            written.append(statement)
+
+    event.listen(store.engine, "before_cursor_execute", noted)
+    return written
+
+
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory: pytest.TempPathFactory) -> dict[int, list[object]]:
     """What a computation from nothing gives, with the first keyframe and without."""
@@ -62,6 +75,7 @@ def test_only_what_changed_is_computed_and_contents_are_the_same(
     assert sizes(store)["lift"] == sizes(store)["grid"] == sizes(store)["look"] == 4
     ingest(store, [3, 0], spoiled=True)
     asked = asked_for(monkeypatch)
+    monkeypatch.setattr(threads.os, "sched_getaffinity", lambda _: {0, 1, 2}, raising=False)
     refine(store, info)
     assert contents(store) == reference[0]
     lifts = [there for kind, there in asked if kind == "lift"]
@@ -71,6 +85,7 @@ def test_only_what_changed_is_computed_and_contents_are_the_same(
     first = next(head.id for head in store.keyframe_heads(info.id) if head.frame_index == 0)
     store.delete_keyframes([first])
     asked.clear()
+    monkeypatch.setattr(threads.os, "sched_getaffinity", lambda _: {0}, raising=False)
     refine(store, info)
     assert contents(store) == reference[1]
     assert all(there for kind, there in asked if kind in ("lift", "surface"))
@@ -78,9 +93,12 @@ def test_only_what_changed_is_computed_and_contents_are_the_same(
     # again, of the same keyframes: nothing is computed, and no image read
     asked.clear()
     forget(store.engine, info.id, LANDMARKS)
+    written = changes_of(store)
     refine(store, info)
     assert contents(store) == reference[1]
     assert all(there for _, there in asked)
+    assert {kind for kind, _ in asked} >= {"lift", "look", "thing"}
+    assert not [statement for statement in written if "landmark" in statement]
     assert "grid" not in {kind for kind, _ in asked}
     refine(store, info, force=True)  # from nothing
     assert contents(store) == reference[1]

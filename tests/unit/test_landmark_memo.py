@@ -14,7 +14,9 @@ from semdb.landmarks.build import SeenKeyframe, find_landmarks
 from semdb.landmarks.gravity import on_lattice
 from semdb.landmarks.lift import SeenObject, lift_keyframe
 from semdb.landmarks.memo import Arrays, name_of
+from semdb.landmarks.options import SeeOptions
 from semdb.landmarks.places import places_of
+from semdb.landmarks.visibility import THROUGH, VISIBLE, _look_in, collect, look
 from semdb.recordings.synthetic import SyntheticOptions, SyntheticSequence
 
 FRAMES = 7
@@ -116,6 +118,21 @@ def test_what_another_place_sees_is_not_computed_again() -> None:
     memo.asked = {True: 0, False: 0}
     find_landmarks(frames, 5, memo=memo)
     assert memo.asked[False] == 0
+
+
+def test_beyond_its_reach_a_keyframe_sees_nothing() -> None:
+    lifted = [frame.lifted for frame in keyframes()]
+    sightings, see = collect(lifted), SeeOptions()
+    views = look(lifted, sightings, see)
+    seen = set(zip(views.sighting.tolist(), views.keyframe.tolist(), strict=True))
+    everything, beyond = np.arange(len(sightings)), 0
+    for number, frame in enumerate(lifted):
+        rows, _, counts, pair, _, both = _look_in(number, frame, sightings, everything, see)
+        outside = np.array([(row, number) not in seen for row in rows.tolist()])
+        beyond += np.count_nonzero(outside)
+        assert not counts[outside][:, [VISIBLE, THROUGH]].any()
+        assert not both[outside[pair]].any()  # nor behind a mask
+    assert beyond > 0
 
 
 def test_names_tell_apart_what_is_not_the_same() -> None:
