@@ -161,6 +161,8 @@ class LandmarkParts:
         with self._lock:
             self._used.add((kind, name))
             self._new[kind, name] = data
+            if kind in self._large:
+                self._large[kind].add(name)
             self._waiting += len(data) if kind in self.LARGE else 0
             first = {key: self._new.pop(key) for key in list(self._new) if key[0] in self.FIRST and self._is_full}
             self._waiting = 0 if first else self._waiting

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -134,10 +134,10 @@ def lift_keyframe(
             inner = np.sort(buffers[1][:number])
             values = known.ravel()[inner]
         rest = rim_pixels(known, owner, k + 1, border + 2, inner, number, box, state, buffers[1], buffers[2])
-        edge, fitted = _points(
-            camera, buffers[1][:rest], buffers[2][:rest], lift.outline // 2, known, owner == k + 1, noise
-        )
-        body, fitted_too = _points(camera, inner, values, lift.outline // 2, known, owner == k + 1, noise)
+        seen = (slice(box[1], box[3]), slice(box[0], box[2]))
+        own = (np.where(owner[seen] == k + 1, known[seen], np.float32(np.nan)), int(box[0]), int(box[1]))
+        edge, fitted = _points(camera, buffers[1][:rest], buffers[2][:rest], lift.outline // 2, own, noise)
+        body, fitted_too = _points(camera, inner, values, lift.outline // 2, own, noise)
         outline.append(np.concatenate([body, edge]))
         planes = np.concatenate([fitted, fitted_too])
         if len(planes):  # a mask may lie where the lens model says nothing
@@ -201,26 +201,28 @@ def _points(
     pixels: Int64Array,
     inner: Float32Array,
     most: int,
-    depth: Float32Array | None = None,
-    mask: BoolArray | None = None,
+    own: tuple[Float32Array, int, int] | None = None,
     noise: float = 1.0,
 ) -> tuple[Float32Array, BoolArray]:
     """Camera-frame points ``[k, 3]`` of flat `pixels` ``[n]``, at most `most`, evenly taken, and which lie on planes.
 
-    Their depth is that of an inner pixel nearby, `inner` ``[n]``; or, with `depth` and `mask` ``[H, W]``, their own,
-    where that is as near as the thing is wide, or that of a plane fitted to the mask's pixels around, where `noise`
-    (see `measured_noise`) explains the difference: what is measured well enough has edges.
+    Their depth is that of an inner pixel nearby, `inner` ``[n]``; or, with `own`, depth ``[h, w]`` about the mask, NaN
+    outside of it, and its first column and row, their own, where that is as near as the thing is wide, or that of a
+    plane fitted to the mask's pixels around, where `noise` (see `measured_noise`) explains the difference: what is
+    measured well enough has edges.
     """
     wanted = min(len(pixels), most)
     taken = (np.arange(wanted) * len(pixels) + len(pixels) // 2) // max(wanted, 1)
     v, u = np.divmod(pixels[taken], camera.width)
     z = inner[taken].astype(np.float64)
     fitted = np.zeros(wanted, np.bool_)
-    if depth is not None and mask is not None and wanted:
-        own = depth[v, u].astype(np.float64)
+    if own is not None and wanted:
+        depth, left, top = own
+        measured = depth[v - top, u - left].astype(np.float64)
         reach = 0.05 + max(np.ptp(u) / camera.fx, np.ptp(v) / camera.fy) * np.median(z)
-        z = np.where((own > 0) & (np.abs(own - z) < reach), own, z)
-        plane = lift_points(camera, np.where(mask, depth, np.nan), np.column_stack([u, v]).astype(np.float32))[:, 2]
+        z = np.where((measured > 0) & (np.abs(measured - z) < reach), measured, z)
+        part = replace(camera, cx=camera.cx - left, cy=camera.cy - top)
+        plane = lift_points(part, depth, np.column_stack([u - left, v - top]).astype(np.float32))[:, 2]
         fitted = np.isfinite(plane) & (np.abs(plane - z) < EXPLAINED * noise * depth_noise(z))
         z = np.where(fitted, plane, z)
     rays = pixels_to_normalized(camera, np.column_stack([u, v]))
