@@ -26,6 +26,7 @@ from semdb.database.landmark_reading import StoredLandmark
 from semdb.geometry import invert_pose, pose_error
 from semdb.landmarks.boxes import upright_axes
 from semdb.landmarks.build import find_landmarks
+from semdb.landmarks.longest import longest_of
 from semdb.landmarks.values import Landmarks
 from semdb.localization.landmark_kernels import LEAST_INSIDE, predict
 from semdb.localization.landmark_pose import (
@@ -127,7 +128,7 @@ def room_images(seed: int) -> RoomImages:
     numbers, mistakes = class_numbers([whole]), SPOILED_NOISY
     room = replace(whole, frames=whole.frames[::2])
     keyframes, _ = seen_keyframes(room, numbers, mistakes)
-    found = find_landmarks(keyframes, len(numbers))
+    found = find_landmarks(keyframes, len(numbers), longest=longest_of(list(numbers)))
     poses = np.stack([frame.pose for frame in room.frames])
     landmarks = map_landmarks(stored(found, list(numbers)), poses, found.gravity.up, whole.camera, {})
     if landmarks is None:

@@ -37,11 +37,13 @@ def find_landmarks(
     options: LandmarkOptions | None = None,
     progress: Progress | None = None,
     memo: Memo | None = None,
+    longest: FloatArray | None = None,
 ) -> Landmarks:
     """The landmarks of a map, of its keyframes by recording's name and frame.
 
     `confusion` ``[classes, classes]``: shares of what goes by another name (see `evidence.name_probabilities`). `up`
     ``[3]``: which way is up, where that is known. `memo`: what was found before, of keyframes that have names.
+    `longest` ``[classes]``, metres: a thing with a longer side is of another class (see `longest`).
     """
     options, memo = options or LandmarkOptions(), memo or Forgetful()
     lifted = [frame.lifted for frame in keyframes]
@@ -55,7 +57,8 @@ def find_landmarks(
     views = look(lifted, sightings, options.see, progress, memo)
     names = name_probabilities(classes, confusion)
     cluster = associate(keyframes, lifted, sightings, views, names, options)
-    found = Assembly(keyframes, lifted, sightings, views, cluster, names, gravity, options, memo)
+    bounds = np.full(classes, np.inf) if longest is None else longest
+    found = Assembly(keyframes, lifted, sightings, views, cluster, (names, bounds), gravity, options, memo)
     landmarks = found.all()
     objects = sum(len(frame.category) for frame in keyframes)
     placed = sum(len(thing.members) for thing in landmarks)

@@ -138,8 +138,9 @@ class VisitOptions:
 @dataclass(frozen=True, slots=True)
 class LandmarkOptions:
     """All options. A landmark is confirmed by so many keyframes, which are at least a share of those that should have
-    seen it; `gone`: later keyframes that see through it. `one_place`: two that no keyframe saw beside each other are
-    one where so much of the smaller box lies in the other.
+    seen it; one counts as far as its highest score under the landmark's name is that of a `sure_score`, and all
+    together have to make up for as many sure ones. `gone`: later keyframes that see through it. `one_place`: two that
+    no keyframe saw beside each other are one where so much of the smaller box lies in the other.
     """
 
     lift: LiftOptions = LiftOptions()
@@ -149,6 +150,7 @@ class LandmarkOptions:
     shape: ShapeOptions = ShapeOptions()
     visit: VisitOptions = VisitOptions()
     confirmed: int = 3
+    sure_score: float = 0.5
     confirmed_share: float = 0.2
     gone: int = 2
     one_place: float = 0.3

@@ -161,6 +161,20 @@ def without_objects(lifted: LiftedKeyframe) -> LiftedKeyframe:
     )
 
 
+def test_weak_sightings_confirm_by_their_sum_and_no_thing_larger_than_its_class(room: Room, found: Landmarks) -> None:
+    def again(score: float, longest: float) -> dict[tuple[int, int], LandmarkState]:
+        frames = [replace(frame, score=np.full(len(frame.score), score)) for frame in room.keyframes(room.poses)]
+        things = find_landmarks(frames, len(room.names), longest=np.full(len(room.names), longest)).landmarks
+        return {thing.key: thing.state for thing in things}
+
+    confirmed = {thing.key: thing for thing in found.landmarks if thing.state is LandmarkState.CONFIRMED}
+    weak = again(0.25, np.inf)
+    for key, thing in confirmed.items():
+        enough = 0.25 * thing.keyframes >= 0.5 * max(3, 0.2 * (thing.keyframes + thing.missed))
+        assert (weak[key] is LandmarkState.CONFIRMED) == enough
+    assert set(again(0.9, 0.01).values()) == {LandmarkState.TENTATIVE}
+
+
 def test_a_map_without_objects_or_depth_has_no_landmarks(room: Room) -> None:
     assert find_landmarks([], 1).landmarks == ()
     blind = lift_keyframe(room.camera, room.poses[0], None, [SeenObject(0, 0.9, np.ones((240, 320), bool))])
