@@ -87,6 +87,7 @@ class PoseEstimate:
     aligned: int = 0  # pairs whose patches are alike to a fraction of a pixel; 0 without images
     recorded: FloatArray | None = None  # [6, 6] of how far poses recorded here are off, beyond `covariance`
     at: AtQuery | None = None  # where these errors meet the query
+    turn: FloatArray | None = None  # [3] rad, of the query in its own frame while it was read out; None without bundle
     seen: Alignment | None = None  # where the query shows `pairs`, to a fraction of a pixel where patches were aligned
 
 
@@ -232,7 +233,7 @@ def estimate_pose(
     aligned = int(np.count_nonzero(seen.found))
     alignment = Alignment(seen.xy[keep], seen.found[keep])
     at = at_query(refined.nearest, refined.turn, estimate.per_keyframe, estimate.world_from_camera)
-    found = replace(estimate, aligned=aligned, at=at, seen=alignment)
+    found = replace(estimate, aligned=aligned, at=at, turn=refined.turn[0], seen=alignment)
     if not options.evident:
         return found
     # by what this query shows, what its keyframes' recordings do, and what is usual

@@ -33,7 +33,7 @@ class PlacingOptions:
     least_spread: float = 0.19
     most_sigma_m: float = 0.06
     most_sigma_deg: float = 1.5
-    pose: PoseOptions = field(default_factory=lambda: PoseOptions(most_pairs=400, rematched=False, evident=False))
+    pose: PoseOptions = field(default_factory=lambda: PoseOptions(most_pairs=400, rematched=False))
     verdict: VerdictOptions = field(default_factory=VerdictOptions)
 
 
@@ -43,9 +43,13 @@ class MotionOptions:
 
     Between frames its velocity changes as by accelerations of `acceleration` (m/s^2) and `turn_acceleration` (rad/s^2),
     those of a hand or a robot. A step seen between two images is uncertain by what its pairs say times `step_factor`,
-    by `step_m`, `step_rad`, and by shares of itself: a rolling shutter bends images of a camera that turns, and maps
-    whose poses are not quite consistent are bent. How much of it there is shows in how far poses in the map are from
-    where steps put them: that scales this noise, from `first_unrest` on, over about `memory` frames.
+    by `step_m`, `step_rad`, and by shares of itself: a rolling shutter bends images of a camera that turns. An exact
+    step is uncertain by what its pairs say times `exact_factor`, by a share of its way, and by a share of how far the
+    images turned while they were read out. Maps whose recorded poses are not quite those of their images are bent, and
+    a pose in them moves otherwise than the camera: `recorded` times the variance that keyframes show of that is added,
+    and where that and the turns make more than `bent_m` no step is looked at exactly.
+    How much of the rest there is shows in how far poses in the map are from where steps put them: that scales this
+    noise, from `first_unrest` on, over about `memory` frames.
     Odometry of the robot is uncertain by shares of the way and of the turn. Of the variance of a pose in the map, the
     share `lasting` is common to what is seen from about the same place (errors of keyframes' poses and depth): it goes
     away over `forgotten` of `pose_distances`, not with time.
@@ -62,13 +66,22 @@ class MotionOptions:
     step_turn_share: float = 0.01
     step_way_share: float = 0.01
     step_m_per_rad: float = 0.02
+    exact_factor: float = 1.4
+    exact_m: float = 0.0001
+    exact_rad: float = 0.0001
+    exact_way_share: float = 0.02
+    exact_m_per_rad: float = 0.06
+    exact_rad_per_rad: float = 0.05
+    recorded: float = 3.0
+    bent_m: float = 0.004
     first_unrest: float = 4.0
-    most_unrest: float = 36.0
+    least_unrest: float = 0.05
+    most_unrest: float = 100.0
     memory: float = 12.0
     odometry_share: float = 0.03
     odometry_m: float = 0.002
     odometry_rad: float = 0.002
-    lasting: float = 0.15
+    lasting: float = 0.05
     forgotten: float = 1.0
 
 

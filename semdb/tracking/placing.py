@@ -1,4 +1,4 @@
-"""A frame placed near to where it should be: by keyframes of the map, and by the frame before it."""
+"""A frame placed near to where it should be, by keyframes of the map."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import poselib
 
-from semdb.geometry import invert_pose, so3_log, transform_points
+from semdb.geometry import invert_pose, transform_points
 from semdb.localization.adjustment import in_front
 from semdb.localization.confidence import gather_evidence, sigmas
 from semdb.localization.matching import Matches, no_matches
@@ -28,14 +28,9 @@ from semdb.localization.rivals import rival_pose
 from semdb.localization.verdict import judge
 from semdb.localization.views import KeyframeView, View
 from semdb.tracking.options import PlacingOptions
-from semdb.tracking.pose_filter import Step
 from semdb.types import FloatArray, Verdict
 
-LEAST_STEP_PAIRS = 25
-STEP_PX = 3.0  # of pairs of two images that agree on a step
-CAUCHY_PX = 1.0
 FIT_ITERATIONS = 25  # of a pose from a start; the last ones change nothing that matters
-STEP_RADIUS_PX = 40.0  # around where the motion before puts a point
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,7 +99,7 @@ def _first_pose(
     view: View, pairs: Pairs, points: FloatArray, predicted: FloatArray, options: PlacingOptions
 ) -> tuple[FloatArray, float] | None:
     """A rough ``camera_from_world`` and the share of pairs that agree: from the prediction, else by random samples."""
-    fitted = _fitted(view, invert_pose(predicted), pairs, points, options.pose.max_reprojection_px)
+    fitted = fitted_pose(view, invert_pose(predicted), pairs, points, options.pose.max_reprojection_px)
     if fitted is not None:
         share = float((reprojection_px(view, fitted, pairs.query, points) < options.pose.max_reprojection_px).mean())
         if share >= options.strong_share:
@@ -115,7 +110,7 @@ def _first_pose(
     return found[0], float(found[1].mean())
 
 
-def _fitted(view: View, start: FloatArray, pairs: Pairs, points: FloatArray, scale_px: float) -> FloatArray | None:
+def fitted_pose(view: View, start: FloatArray, pairs: Pairs, points: FloatArray, scale_px: float) -> FloatArray | None:
     """``camera_from_world`` from a start, with a loss that leaves out what is far off; None where it diverges."""
     first = poselib.CameraPose()
     first.R, first.t = start[:3, :3], start[:3, 3]
@@ -174,88 +169,3 @@ def project_all(view: View, keyframes: Sequence[KeyframeView], pose: FloatArray)
         at[~(np.abs(at) < half).all(axis=1)] = np.nan
         found.append(at)
     return found
-
-
-def step_between(
-    before: KeyframeView, view: View, expected: FloatArray, options: PlacingOptions, *, steady: bool = True
-) -> Step | None:
-    """The motion from the image `before`, whose world is its own camera, to `view`; `expected` ``[4, 4]`` is a guess.
-
-    Pairs are looked for where the guess puts them, then everywhere; where the camera is not `steady`, so that guesses
-    are wrong anyway, the other way round. None where too few agree.
-    """
-
-    def guided() -> Step | None:
-        near = replace(options.pose.matching, guided_radius_px=STEP_RADIUS_PX)
-        pairs = guided_pairs(view, [before], project_all(view, [before], expected), near)
-        return _step(before, view, pairs, options, expected)
-
-    def anywhere() -> Step | None:
-        return _step(before, view, _all_pairs(before, view, options), options)
-
-    first, second = (guided, anywhere) if steady else (anywhere, guided)
-    return first() or second()
-
-
-def is_steady(view: View, expected: FloatArray, found: FloatArray) -> bool:
-    """Whether a step ``[4, 4]`` was one that `expected` lets pairs of it be found."""
-    turn = so3_log(expected[:3, :3].T @ found[:3, :3])
-    return float(np.linalg.norm(turn)) * view.focal < STEP_RADIUS_PX / 2
-
-
-def _all_pairs(before: KeyframeView, view: View, options: PlacingOptions) -> Pairs:
-    [matches] = match_views(view, [before], options.pose)
-    return Pairs(matches.query, np.zeros(len(matches), np.int32), matches.keyframe, matches.same_class)
-
-
-def _step(
-    before: KeyframeView, view: View, pairs: Pairs, options: PlacingOptions, expected: FloatArray | None = None
-) -> Step | None:
-    if len(pairs) < LEAST_STEP_PAIRS:
-        return None
-    points = world_points_of(pairs, [before])
-    sample = np.linspace(0, len(pairs) - 1, min(options.sampled, len(pairs))).astype(np.int32)
-    pairs, points = pairs.take(sample), points[sample]
-    if expected is None:
-        found = robust_pnp(view, pairs, points, options.pose, options.iterations)
-        start = None if found is None else found[0]
-    else:
-        start = _fitted(view, invert_pose(expected), pairs, points, options.pose.max_reprojection_px)
-    if start is None:
-        return None
-    near = reprojection_px(view, start, pairs.query, points) < STEP_PX
-    if near.sum() < LEAST_STEP_PAIRS or near.mean() < options.strong_share:
-        return None
-    pairs, points = pairs.take(near), points[near]
-    after_from_before = _fitted(view, start, pairs, points, CAUCHY_PX)
-    if after_from_before is None:
-        return None
-    covariance = _covariance_of(view, after_from_before, view.xy[pairs.query] * view.focal, points)
-    return None if covariance is None else Step(invert_pose(after_from_before), covariance)
-
-
-def _covariance_of(view: View, pose: FloatArray, pixels: FloatArray, points: FloatArray) -> FloatArray | None:
-    """``[6, 6]`` of a step in the frame before it (m, left rad), from how far pixels ``[n, 2]`` are off."""
-    local = transform_points(pose, points)
-    x, y, z = local.T
-    error = (local[:, :2] / z[:, None]) * view.focal - pixels
-    variance = float(np.median((error**2).sum(axis=1)) / (2 * np.log(2)))  # Rayleigh
-    weight = 1 / (1 + (error**2).sum(axis=1) / CAUCHY_PX**2)
-    jacobian = np.zeros((len(points), 2, 6))  # of a translation and a left rotation of the camera's frame
-    jacobian[:, 0, 0] = jacobian[:, 1, 1] = view.focal / z
-    jacobian[:, 0, 2], jacobian[:, 1, 2] = -view.focal * x / z**2, -view.focal * y / z**2
-    turned = np.zeros((len(points), 3, 3))  # d(exp(w) p) / dw
-    turned[:, 0, 1], turned[:, 0, 2], turned[:, 1, 2] = z, -y, x
-    turned -= turned.transpose(0, 2, 1)
-    jacobian[:, :, 3:] = jacobian[:, :, :3] @ turned
-    information = np.einsum("n,nij,nik->jk", weight, jacobian, jacobian) / max(variance, 0.05)
-    try:
-        inverse = np.linalg.inv(information)
-    except np.linalg.LinAlgError:
-        return None
-    # error of after_from_before (left, in the camera after) to that of its inverse: p = -R' t, turned by -R'
-    rotation = pose[:3, :3]
-    adjoint = np.zeros((6, 6))
-    adjoint[:3, :3] = adjoint[3:, 3:] = rotation.T
-    covariance: FloatArray = adjoint @ inverse @ adjoint.T
-    return covariance if np.isfinite(covariance).all() else None

@@ -92,6 +92,14 @@ def surprise(state: FilterState, pose: FloatArray, covariance: FloatArray) -> fl
     return float(innovation @ np.linalg.solve(expected, innovation))
 
 
+def faded(state: FilterState, times: float) -> FilterState:
+    """A state that a convincing measurement contradicts: its variance grows, so that it is not defended.
+
+    A fading memory, as in Fagin, Recursive linear regression theory (1964), at the one frame where it is needed.
+    """
+    return FilterState(state.pose, state.bias, state.covariance * times)
+
+
 def measured(state: FilterState, pose: FloatArray, covariance: FloatArray, options: MotionOptions) -> FilterState:
     """The state after a measurement in the map, `pose` with `covariance` ``[6, 6]``."""
     shared, own = options.lasting * covariance, (1 - options.lasting) * covariance

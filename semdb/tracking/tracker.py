@@ -17,19 +17,20 @@ from semdb.tracking.options import MotionOptions, TrackerOptions
 from semdb.tracking.placing import (
     Placed,
     convinces,
-    is_steady,
     place_anywhere_near,
     place_near,
     search_radius_px,
-    step_between,
 )
-from semdb.tracking.pose_filter import FilterState, Step, begin, measured, moved, surprise, transition_of
+from semdb.tracking.pose_filter import FilterState, Step, begin, faded, measured, moved, surprise, transition_of
 from semdb.tracking.smoothing import Passage
 from semdb.tracking.states import TrackedPose, TrackSource, TrackState
+from semdb.tracking.steps import FrameBefore, SeenStep, is_steady, refined_step, step_between
 from semdb.types import FloatArray, Localization, Verdict
 
 USUAL_DISTANCE_M = 2.0  # of what is seen, where nothing is known of it
 SHORTEST_S = 1e-4
+BENT_EVERY = 5  # frames
+LEAST_ROUGH = 0.25  # of the unrest, for steps that are not exact
 
 
 class MapKeyframes(Protocol):
@@ -67,13 +68,15 @@ class Tracker:
         self._unseen_s = 0.0  # since then
         self._time_s = -np.inf  # of the last frame
         self._seen_s = -np.inf  # of the last one that was placed in the map
-        self._before: KeyframeView | None = None  # the last frame with points, in its own camera
+        self._before: FrameBefore | None = None  # the last frame with points
         self._steady = True  # it goes on as it went, as far as the last two images show
         self._odometry: FloatArray | None = None  # at the last frame
         self._waiting: list[_Fix] = []
         self._map_from_odom: FloatArray | None = None
         self._begun = False  # the last relocalization began anew
         self.passage = Passage(None, None, None)  # of the last frame, for a smoother
+        self._recorded: FloatArray | None = None  # [6, 6] how far recorded poses are off their images hereabouts
+        self._since_bent = -1  # frames since that was looked at
         self._unrest = self.options.motion.first_unrest  # how much worse steps are than their noise says, squared
 
     def update(
@@ -88,15 +91,19 @@ class Tracker:
         gap_s = time_s - self._time_s
         if not gap_s > SHORTEST_S:
             raise ValueError(f"frames come in the order of their times: {time_s} s is not after {self._time_s} s")
-        step, source = self._motion(view, gap_s, odom_from_camera)
-        predicted, transition = None, None
-        if self._state is not None and step is not None:
-            transition = transition_of(self._state, step, self.options.motion)
-            predicted = self._state = moved(self._state, step, self.options.motion)
+        step, source, seen = self._motion(view, gap_s, odom_from_camera)
+        before, predicted, transition = self._state, None, None
+        if before is not None and step is not None:
+            self._state = moved(before, step, self.options.motion)
+        placed = self._by_keyframes(view)
+        if placed is not None and seen is not None:
+            step = self._exactly(view, seen, placed) or step
+        if before is not None and step is not None:
+            transition = transition_of(before, step, self.options.motion)
+            predicted = self._state = moved(before, step, self.options.motion)
         self._waiting = [
             replace(fix, state=moved(fix.state, step, self.options.motion)) for fix in self._waiting if step is not None
         ]
-        placed = self._by_keyframes(view)
         found = None if placed is None else self._accept(view, placed, time_s)
         if found is None:
             found = self._relocalized(view, time_s, relocalize) or self._carried_on(time_s, source)
@@ -106,10 +113,12 @@ class Tracker:
         found = self._with_odometry(found, odom_from_camera)
         return replace(found, latency_ms=(time.perf_counter() - started) * 1000)
 
-    def _motion(self, view: View, gap_s: float, odom_from_camera: FloatArray | None) -> tuple[Step | None, TrackSource]:
+    def _motion(
+        self, view: View, gap_s: float, odom_from_camera: FloatArray | None
+    ) -> tuple[Step | None, TrackSource, SeenStep | None]:
         """How the camera went since the last frame: by its odometry or as it went, and by what both images show."""
         if self._state is None and not self._waiting:
-            return None, TrackSource.NONE
+            return None, TrackSource.NONE, None
         options, source = self.options.motion, TrackSource.PREDICTED
         if odom_from_camera is not None and self._odometry is not None:
             step, source = odometry_step(self._odometry, odom_from_camera, options), TrackSource.ODOMETRY
@@ -117,11 +126,40 @@ class Tracker:
             step = predicted_step(self._velocity, gap_s, self._unseen_s, options)
         if self._before is not None and self.options.step:
             expected = step.before_from_after
-            seen = step_between(self._before, view, expected, self.options.placing, steady=self._steady)
+            before, placing = self._before.keyframe, self.options.placing
+            seen = step_between(before, view, expected, placing, steady=self._steady)
             if seen is not None:
-                self._steady = is_steady(view, expected, seen.before_from_after)
-                return Step(seen.before_from_after, seen_noise(seen, options, self._unrest)), TrackSource.ODOMETRY
-        return step, source
+                found = seen.step
+                self._steady = is_steady(view, expected, found.before_from_after)
+                noise = seen_noise(found, options, max(self._unrest, LEAST_ROUGH)) + self._bending()
+                return Step(found.before_from_after, noise), TrackSource.ODOMETRY, seen
+        return step, source, None
+
+    def _bending(self) -> FloatArray:
+        """How much otherwise than the camera ``[6, 6]`` a pose in the map moves here, its recorded poses being off."""
+        if self._recorded is None:
+            return np.zeros((6, 6))
+        own = np.diag(self._recorded)
+        bent: FloatArray = self.options.motion.recorded * np.diag(np.repeat([own[:3].mean(), own[3:].mean()], 3))
+        return bent
+
+    def _exactly(self, view: View, seen: SeenStep, placed: Placed) -> Step | None:
+        """A step between two images again, now that it is known how they turned while they were read out.
+
+        None where that says nothing that is not known better by the map.
+        """
+        motion = self.options.motion
+        if self._before is None or placed.estimate.turn is None:
+            return None
+        turns = [self._before.turn, placed.estimate.turn]
+        turned = sum(float(np.linalg.norm(turn)) for turn in turns if turn is not None)
+        bent = self._bending()
+        if bent[0, 0] + self._unrest * (motion.exact_m_per_rad * turned) ** 2 > motion.bent_m**2:
+            return None
+        found = refined_step(self._before, view, seen, placed.estimate.turn)
+        if found is None:
+            return None
+        return Step(found.before_from_after, exact_noise(found, turned, motion, self._unrest) + bent)
 
     def _by_keyframes(self, view: View) -> Placed | None:
         """A pose by the keyframes near to where the camera should be."""
@@ -134,7 +172,13 @@ class Tracker:
             return None
         view, distance = in_kind_of(keyframes, view), _distance_of(keyframes[0], pose)
         radius = search_radius_px(view, self._state.pose_covariance, distance, placing)
-        return place_near(view, keyframes, pose, radius, placing) or place_anywhere_near(view, keyframes, placing)
+        # how bent the map is shows slowly and costs time: it is looked at now and then
+        self._since_bent = (self._since_bent + 1) % BENT_EVERY
+        near = replace(placing, pose=replace(placing.pose, evident=self._since_bent == 0))
+        placed = place_near(view, keyframes, pose, radius, near) or place_anywhere_near(view, keyframes, placing)
+        if placed is not None and placed.estimate.recorded is not None:
+            self._recorded = placed.estimate.recorded
+        return placed
 
     def _accept(self, view: View, placed: Placed, time_s: float) -> TrackedPose | None:
         """The frame with a pose near keyframes, unless it contradicts the motion."""
@@ -151,7 +195,7 @@ class Tracker:
                 or not convinces(view, placed, self.options.placing)
             ):
                 return None
-            covariance = covariance * off
+            state = faded(state, off)
         self._learn(off)
         self._state = measured(state, placed.pose, covariance, self.options.motion)
         self._seen_s, self._waiting = time_s, []
@@ -162,7 +206,9 @@ class Tracker:
         """Takes into account how far a pose was off, in units of the gate, for the noise of steps to come."""
         motion = self.options.motion
         seen = np.clip(self._unrest * off * self.options.gate / 6, 0.0, motion.most_unrest)  # six is expected
-        self._unrest = float(np.clip(self._unrest + (seen - self._unrest) / motion.memory, 0.25, motion.most_unrest))
+        self._unrest = float(
+            np.clip(self._unrest + (seen - self._unrest) / motion.memory, motion.least_unrest, motion.most_unrest)
+        )
 
     def _relocalized(self, view: View, time_s: float, relocalize: Relocalize) -> TrackedPose | None:
         """The frame as found in the whole map: at once where the motion agrees, else when a second one agrees."""
@@ -260,7 +306,9 @@ class Tracker:
             self._velocity = np.concatenate([motion[:3, 3], so3_log(motion[:3, :3])]) / gap_s
         seen = found.state is TrackState.TRACKING or moved_by is TrackSource.ODOMETRY
         self._unseen_s = 0.0 if seen else self._unseen_s + gap_s
-        self._before = _with_points(view, placed if found.source is TrackSource.TRACKED else None)
+        placed = placed if found.source is TrackSource.TRACKED else None
+        own = _with_points(view, placed)
+        self._before = None if own is None else FrameBefore(own, None if placed is None else placed.estimate.turn)
 
     def _with_odometry(self, found: TrackedPose, odom_from_camera: FloatArray | None) -> TrackedPose:
         """The same with what corrects the odometry; it stays as it was while nothing is measured."""
@@ -305,6 +353,15 @@ def seen_noise(step: Step, options: MotionOptions, unrest: float = 1.0) -> Float
     metres = options.step_m + options.step_way_share * way + options.step_m_per_rad * turn
     radians = options.step_rad + options.step_turn_share * turn
     found: FloatArray = step.covariance * options.step_factor**2 + unrest * np.diag([metres**2] * 3 + [radians**2] * 3)
+    return found
+
+
+def exact_noise(step: Step, turned: float, options: MotionOptions, unrest: float) -> FloatArray:
+    """The same of one that knows how the images turned while they were read out, `turned` (rad) together."""
+    metres = options.exact_m + options.exact_m_per_rad * turned
+    metres += options.exact_way_share * float(np.linalg.norm(step.before_from_after[:3, 3]))
+    radians = options.exact_rad + options.exact_rad_per_rad * turned
+    found: FloatArray = step.covariance * options.exact_factor**2 + unrest * np.diag([metres**2] * 3 + [radians**2] * 3)
     return found
 
 
