@@ -1,4 +1,4 @@
-"""Compiled part of `blobs`: rows of a whole number and a blob in what a server sent."""
+"""Compiled parts of `blobs`: rows of a whole number and a blob, or of a number, in what a server sent."""
 
 # compiled functions take what numba infers
 # mypy: disable-error-code="no-untyped-call"
@@ -39,5 +39,28 @@ def split_rows(data, start, stop, number, out):  # type: ignore[no-untyped-def] 
         if wide > 3 or at + length != end:
             break
         out[found, 0], out[found, 1], out[found, 2] = value, at, end
+        found, start = found + 1, end
+    return found, start
+
+
+@kernel
+def split_numbers(data, start, stop, number, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """The same for rows of one whole number alone, of at most 18 digits: ``out[n]`` gets them."""
+    found = 0
+    while found < len(out) and start + 5 < stop:
+        size, digits = int(data[start]), int(data[start + 4])
+        end = start + 4 + size
+        if end > stop or data[start + 1] or data[start + 2] or data[start + 3] != (number + found) % 256:
+            break
+        if digits + 1 != size or digits < 1 or digits > 18:
+            break
+        value, wrong = 0, False
+        for place in range(start + 5, end):
+            digit = int(data[place]) - 48
+            wrong |= digit < 0 or digit > 9
+            value = 10 * value + digit
+        if wrong:
+            break
+        out[found] = value
         found, start = found + 1, end
     return found, start

@@ -6,7 +6,7 @@ and COM_STMT_EXECUTE) has nothing to read. It is used for an INSERT with a blob 
 else, so that no result in binary has to be understood.
 
 PyMySQL reads each row in two or three calls and makes objects of each; within `in_bulk` what a socket holds is read at
-once, and rows are taken out of it.
+once, and rows are taken out of it, or stay where they were read (`semdb.database.packed`).
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ from pymysql.connections import MySQLResult
 from pymysql.constants import COMMAND, CR, SERVER_STATUS
 from pymysql.cursors import Cursor
 from sqlalchemy import Connection
+
+from semdb.database.packed import Numbers, PackedRows
 
 KEPT = 32  # prepared statements of a connection; semdb has fewer that carry blobs
 _PREPARE, _EXECUTE = 0x16, 0x17
@@ -67,10 +69,11 @@ class BlobCursor(Cursor):  # type: ignore[misc]
         connection = self._get_db()
         if not getattr(connection, "semdb_in_bulk", False):
             return int(super()._query(query))
+        into = connection.semdb_packed
         self._clear_result()
         connection._execute_command(COMMAND.COM_QUERY, query.encode(connection.encoding))
         connection._result = None
-        result = _BulkResult(connection)
+        result = _BulkResult(connection, into)
         result.read()
         connection._result = result
         if result.server_status is not None:
@@ -149,17 +152,20 @@ def _length(size: int) -> bytes:
 
 
 @contextlib.contextmanager
-def in_bulk(connection: Connection) -> Iterator[None]:
-    """Results of many rows are read faster meanwhile, where the driver is PyMySQL."""
+def in_bulk(connection: Connection, into: PackedRows | Numbers | None = None) -> Iterator[None]:
+    """Results of many rows are read faster meanwhile, where the driver is PyMySQL.
+
+    Rows of a whole number and a blob, or of one whole number, go into `into`, and are not in the result.
+    """
     driver = connection.connection.driver_connection
     if connection.dialect.name == "sqlite" or driver is None:
         yield
         return
-    driver.semdb_in_bulk = True
+    driver.semdb_in_bulk, driver.semdb_packed = True, into
     try:
         yield
     finally:
-        driver.semdb_in_bulk = False
+        driver.semdb_in_bulk, driver.semdb_packed = False, None
 
 
 class _BulkResult(MySQLResult):  # type: ignore[misc]
@@ -168,8 +174,12 @@ class _BulkResult(MySQLResult):  # type: ignore[misc]
     connection: Any
     converters: Any
 
+    def __init__(self, connection: Any, into: PackedRows | Numbers | None = None) -> None:
+        super().__init__(connection)
+        self._into = into
+
     def _read_rowdata_packet(self) -> None:
-        rows = _Rows(self.connection, self.converters)
+        rows = _Rows(self.connection, self.converters, self._into)
         try:
             while not rows.ended:
                 rows.take()
@@ -189,6 +199,8 @@ _LONGEST_EOF = 9
 _LOST = "Lost connection to MySQL server during query"
 _NONSENSE = "the server sent what is no row"
 _SOME = 1 << 20  # bytes that are read at once
+_LEAST_NUMBER = 6  # bytes of a packet of one
+_LEAST = 1 << 16  # bytes that there is room for when more is waited for
 _WHOLE = 0xFFFFFF  # a packet of so many bytes goes on in the next
 
 
@@ -218,7 +230,12 @@ def _row(packet: memoryview, encodings: Sequence[str | None], converters: Sequen
 class _Rows:
     """The rows of a result while they are read."""
 
-    def __init__(self, connection: Any, converters: Sequence[tuple[str | None, Any]]) -> None:
+    def __init__(
+        self,
+        connection: Any,
+        converters: Sequence[tuple[str | None, Any]],
+        into: PackedRows | Numbers | None = None,
+    ) -> None:
         self.found: list[tuple[Any, ...]] = []
         self.ended = self.has_next = False
         self.warnings = 0
@@ -226,15 +243,24 @@ class _Rows:
         self._encodings, self._converters = [e for e, _ in converters], [c for _, c in converters]
         self._numbers_and_blobs = [c for _, c in converters] == [int, None] and converters[1][0] is None
         self._table = np.empty((256, 3), np.int64)
-        self._data = np.empty(_SOME, np.uint8)
+        self._numbers = into if isinstance(into, Numbers) and self._converters == [int] else None
+        self._into = into if isinstance(into, PackedRows) and self._numbers_and_blobs else None
+        if self._into is not None:
+            self._into.reserve(_SOME)
+        self._data = np.empty(_SOME, np.uint8) if self._into is None else self._into.data
         self._view = self._data.data
-        self._start, self._stop = 0, _received(connection, self._view, first=True)  # what is there
+        self._start = self._stop = 0 if self._into is None else self._into.used
+        self._stop += _received(connection, self._view[self._stop :], first=True)  # what is there
+        if self._into is not None:
+            self._into.used = self._stop
         self._parts = b""  # of a packet that is more than one
 
     def take(self) -> None:
         """Takes the rows out of what is there."""
         while not self.ended:
-            if self._numbers_and_blobs and not self._parts:
+            if self._numbers is not None:
+                self._take_numbers(self._numbers)
+            elif self._numbers_and_blobs and not self._parts:
                 self._take_many()
             size = self._next_size()
             end = self._start + _HEAD + size
@@ -253,6 +279,9 @@ class _Rows:
         if self.ended:
             return
         needed = _HEAD + max(0, self._next_size())
+        if self._into is not None:
+            self._receive_behind(self._into, needed)
+            return
         rest = self._data[self._start : self._stop]
         if needed > len(self._data):
             self._data = np.empty(needed + _SOME, np.uint8)
@@ -260,6 +289,14 @@ class _Rows:
         self._data[: len(rest)] = rest
         self._start, self._stop = 0, len(rest)
         self._stop += _received(self._connection, self._view[self._stop :])
+
+    def _receive_behind(self, into: PackedRows, needed: int) -> None:
+        """Waits for more, which comes behind all that was received before."""
+        into.used = self._stop
+        into.reserve(max(needed, _LEAST))
+        self._data, self._view = into.data, into.data.data
+        self._stop += _received(self._connection, self._view[self._stop :])
+        into.used = self._stop
 
     def _next_size(self) -> int:
         """Bytes of the next packet; -1 where that is not known yet."""
@@ -281,8 +318,21 @@ class _Rows:
             number = self._connection._next_seq_id
             count, self._start = split_rows(self._data, self._start, self._stop, number, self._table)  # type: ignore[no-untyped-call]
             self._count(count, number)
+            if self._into is not None:
+                self._into.add_table(self._table[:count])
+                continue
             view = self._view
             self.found += [(key, view[at:end].tobytes()) for key, at, end in self._table[:count].tolist()]
+
+    def _take_numbers(self, into: Numbers) -> None:
+        from semdb.database._packets import split_numbers
+
+        room = np.empty((self._stop - self._start) // _LEAST_NUMBER + 1, np.int64)
+        number = self._connection._next_seq_id
+        count, self._start = split_numbers(self._data, self._start, self._stop, number, room)  # type: ignore[no-untyped-call]
+        if count:
+            self._count(count, number)
+            into.add_many(room[:count])
 
     def _take_packet(self, packet: memoryview) -> None:
         if not packet:

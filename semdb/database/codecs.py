@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 import struct
+import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -106,14 +107,6 @@ def decode_vectors(
     """
     if not len(blobs):
         return np.empty((0, size or 0), np.float32)
-    joined = _equal_vectors(blobs)
-    if (
-        joined is not None
-        and size in (None, joined.shape[1])
-        and joined.max() <= _MOST_OF_UNIT  # neither holds for NaN
-        and joined.min() >= -_MOST_OF_UNIT
-    ):
-        return joined
     found = [_vector(blob, int(key)) for blob, key in zip(blobs, keys, strict=True)]
     sizes = Counter(len(vector) for vector in found if not isinstance(vector, CodecError))
     if size is None and sizes:
@@ -137,28 +130,44 @@ _VECTOR = "cnn_vectors.vector of keyframe"
 _MOST_OF_UNIT = 1.01  # a number of a vector of length one
 
 
-def _equal_vectors(blobs: Sequence[Any]) -> Float32Array | None:
-    """Vectors ``[n, d]`` of blobs that all begin alike and are whole; None of others."""
-    size, start = len(blobs[0]), HEAD + 4
-    if set(map(type, blobs)) != {bytes} or set(map(len, blobs)) != {size} or size <= start or (size - start) % 4:
+def decode_packed(
+    data: npt.NDArray[np.uint8],
+    table: Int64Array,
+    size: int | None = None,
+    room: Float32Array | None = None,
+) -> Float32Array | None:
+    """The same of blobs that are in `data`, as the rows of `table` ``[n, 3]`` say (key, first byte, end).
+
+    None where any is damaged or of another length, which `decode_vectors` tells apart. The vectors are in `room`
+    ``[n or more, d]`` where it is given and fits.
+    """
+    lengths = table[:, 2] - table[:, 1]
+    count, start = len(table), HEAD + 4
+    length = int(lengths[0]) if count else 0
+    numbers = (length - start) // 4
+    if length <= start or (length - start) % 4 or (lengths != length).any() or size not in (None, numbers):
         return None
+    if sys.byteorder != "little":
+        return None  # numbers would have to be turned round
+    if room is None or len(room) < count or room.shape[1] != numbers:
+        room = np.empty((count, numbers), np.float32)
     head = _HEADER.pack(ARRAY_MAGIC, 1, _CODES[np.dtype("<f4")], 1, 0, 0)[:_CHECKED]
-    tail = struct.pack("<I", (size - start) // 4)
-    heads = np.frombuffer(b"".join([blob[:start] for blob in blobs]), np.uint8).reshape(len(blobs), start)
+    sizes = struct.pack("<I", numbers)
+    heads = data[table[:, 1:2] + np.arange(start)]
     if (heads[:, :_CHECKED] != np.frombuffer(head, np.uint8)).any() or (
-        heads[:, HEAD:] != np.frombuffer(tail, np.uint8)
+        heads[:, HEAD:] != np.frombuffer(sizes, np.uint8)
     ).any():
         return None
-    found = np.empty((len(blobs), (size - start) // 4), np.dtype("<f4"))
-    out, at, seed, sums = found.reshape(-1).view(np.uint8).data, 0, crc32(tail, crc32(head)), []
-    for blob in blobs:
-        end = at + size - start
-        out[at:end] = memoryview(blob)[start:]
+    found, sums = room[:count], []
+    given, out, at, seed = data.data, found.reshape(-1).view(np.uint8).data, 0, crc32(sizes, crc32(head))
+    for first, last in table[:, 1:].tolist():
+        end = at + length - start
+        out[at:end] = given[first + start : last]
         sums.append(crc32(out[at:end], seed))
         at = end
-    if not np.array_equal(np.array(sums, np.uint32), np.ascontiguousarray(heads[:, _CHECKED:HEAD]).view("<u4")[:, 0]):
-        return None
-    return found.astype(np.float32, copy=False)
+    right = np.array_equal(np.array(sums, np.uint32), np.ascontiguousarray(heads[:, _CHECKED:HEAD]).view("<u4")[:, 0])
+    in_range = found.max() <= _MOST_OF_UNIT and found.min() >= -_MOST_OF_UNIT  # neither holds for NaN
+    return found if right and in_range else None
 
 
 def _vector(blob: Any, key: int) -> Float32Array | CodecError:

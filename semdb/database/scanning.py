@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import operator
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -16,8 +17,9 @@ from semdb.class_score import MOST_OBJECTS, Part, word
 from semdb.database import checked, retry
 from semdb.database.blobs import in_bulk
 from semdb.database.class_filter import classes_of_keyframes
-from semdb.database.codecs import decode_vectors
+from semdb.database.codecs import decode_packed, decode_vectors
 from semdb.database.exact_sums import exact_sum, whole
+from semdb.database.packed import Numbers, PackedRows
 from semdb.database.reading import Bad, by_own_encoder, encoder_id
 from semdb.database.tables import categories, cnn_vectors, keyframe_categories, keyframes, maps, recordings
 from semdb.errors import CodecError
@@ -25,27 +27,39 @@ from semdb.threads import ahead
 from semdb.types import Float32Array, Int64Array
 
 IN_CHUNK = 500
+CHUNK = 2000  # vectors at a time
 FETCH = 50_000  # numbers at a time
-IDS_IN_A_ROW = 48  # at most 20 bytes each: servers cut a joined text off at 1024 bytes, unless told otherwise
+IDS_IN_A_ROW = 1000
 _LARGEST_ID = 2**63 // (MOST_OBJECTS + 1) ** 3 - 1  # that is packed with three numbers
 DENSE = 0.5  # of the ids of a range that are wanted: from here on the range is read, not a list of ids
 
 
 def iter_vectors(
-    engine: Engine, map_id: int, chunk: int = 2000, size: int | None = None, bad: Bad | None = None
+    engine: Engine,
+    map_id: int,
+    chunk: int = CHUNK,
+    size: int | None = None,
+    bad: Bad | None = None,
+    *,
+    in_turn: bool = False,
 ) -> Iterator[tuple[Int64Array, Float32Array]]:
     """All vectors of a map: ids int64 ``[n]``, ascending, and float32 ``[n, d]``, `chunk` at a time.
 
     Each chunk is a transaction of its own, so a keyframe that is deleted meanwhile is left out. `size` and `bad` as in
     `vectors_there`; without `size` it is that of the first chunk. All are by the encoder that the map has at first.
+    `in_turn`: vectors are asked for one chunk after the other, and their memory is that of the chunk before.
     """
     ids = _map_ids(engine, map_id)
     encoder = retry.read(engine, lambda connection: encoder_id(connection, map_id))
     starts = range(0, len(ids), chunk)
-    for rows, without in ahead(_fetched(engine, ids[start : start + chunk], encoder) for start in starts):
+    packs = itertools.cycle((PackedRows(), PackedRows()))  # one is looked at while the other is filled
+    fetched = (_fetched(engine, ids[start : start + chunk], encoder, next(packs)) for start in starts)
+    room: Float32Array | None = None
+    for rows, without in ahead(fetched):
         _tell_missing(without, bad)
-        found, vectors = _decoded(rows, size, bad)
+        found, vectors = _decoded(rows, size, bad, room)
         size = vectors.shape[1] if len(found) else size
+        room = vectors if in_turn and (room is None or len(vectors) > len(room)) else room
         yield found, vectors
 
 
@@ -63,11 +77,12 @@ def _map_ids(engine: Engine, map_id: int) -> Int64Array:
         last = int(numbers[-1])
 
 
-def _fetched(engine: Engine, ids: Int64Array, encoder: int | None) -> tuple[list[tuple[int, bytes]], list[int]]:
-    """Rows of those of `ids` (ascending) that are there, and those without one."""
+def _fetched(engine: Engine, ids: Int64Array, encoder: int | None, rows: PackedRows) -> tuple[PackedRows, list[int]]:
+    """In `rows` those of `ids` (ascending) that are there, and those without one."""
 
-    def work(connection: Connection) -> tuple[list[tuple[int, bytes]], list[int]]:
-        rows = _rows(connection, ids, encoder)
+    def work(connection: Connection) -> tuple[PackedRows, list[int]]:
+        rows.clear()
+        _read_rows(connection, ids, encoder, rows)
         return rows, _without_row(connection, ids, rows)
 
     return retry.read(engine, work)
@@ -83,7 +98,7 @@ def vectors_there(
     `size` is how many numbers they have to have, by default as many as most have. A damaged one is zero and told to
     `bad`, or raises CodecError; so is a keyframe that has none, which is left out.
     """
-    rows, without = _fetched(engine, np.unique(ids), encoder)
+    rows, without = _fetched(engine, np.unique(ids), encoder, PackedRows())
     _tell_missing(without, bad)
     return _decoded(rows, size, bad)
 
@@ -110,7 +125,7 @@ def coarse_rows(
     One that was moved into another map is not there. `completed`: their classes as landmarks complete them.
     """
 
-    def work(connection: Connection) -> tuple[list[tuple[int, bytes]], list[int], list[tuple[int, str, int]]]:
+    def work(connection: Connection) -> tuple[PackedRows, list[int], list[tuple[int, str, int]]]:
         k = keyframes.c
         mine = select(k.id).join(recordings, recordings.c.id == k.recording_id).where(recordings.c.map_id == map_id)
         asked = np.unique(ids).tolist()
@@ -127,7 +142,8 @@ def coarse_rows(
             for part, number in zip(Part, map(_held, numbers), strict=True)
             if number
         ]
-        rows = _rows(connection, wanted, encoder_id(connection, map_id))
+        rows = PackedRows()
+        _read_rows(connection, wanted, encoder_id(connection, map_id), rows)
         return rows, _without_row(connection, wanted, rows), shown
 
     rows, without, shown = retry.read(engine, work)
@@ -176,15 +192,20 @@ def category_columns(
 
 
 def _numbers(connection: Connection, query: Select[tuple[int]], step: int) -> Int64Array:
-    """The numbers of a query of one column, ascending; those of `IDS_IN_A_ROW` ids in a row come as one text.
+    """The numbers of a query of one column, ascending.
 
-    Drivers in Python take longer for a row than servers do for a hundred.
+    Python takes longer for a row than databases do for a hundred: those of `IDS_IN_A_ROW` ids in a row come as one
+    text of SQLite, and as they are in what a server sends.
     """
+    if connection.dialect.name != "sqlite":
+        numbers = Numbers()
+        with in_bulk(connection, numbers), connection.execute(query) as result:
+            numbers.add_many(np.array([row[0] for row in result.cursor.fetchall()], np.int64))
+        return np.sort(numbers.all())
     rows = query.subquery("packed").c
     width = literal(step * IDS_IN_A_ROW, BigInteger)
     texts = select(func.group_concat(rows.number)).group_by(rows.number - rows.number % width)
-    with in_bulk(connection), connection.execute(texts) as result:
-        found = ",".join(str(text) for (text,) in result.cursor.fetchall())
+    found = ",".join(str(text) for text in connection.execute(texts).scalars())
     return np.sort(np.array(found.split(","), np.int64)) if found else np.empty(0, np.int64)
 
 
@@ -254,40 +275,41 @@ def map_identity(engine: Engine, map_id: int) -> str:
     return "" if row is None else f"{row.name} {row.created_at}"
 
 
-def _decoded(rows: list[tuple[int, bytes]], size: int | None, bad: Bad | None) -> tuple[Int64Array, Float32Array]:
-    found = np.array([row[0] for row in rows], np.int64)
-    if (found[1:] < found[:-1]).any():
-        rows = [rows[place] for place in np.argsort(found, kind="stable").tolist()]
-        found = np.sort(found)
-    return found, decode_vectors([row[1] for row in rows], found, size, bad)
+def _decoded(
+    rows: PackedRows, size: int | None, bad: Bad | None, room: Float32Array | None = None
+) -> tuple[Int64Array, Float32Array]:
+    table = rows.table()
+    if not rows.others and (vectors := decode_packed(rows.data, table, size, room)) is not None:
+        return table[:, 0].copy(), vectors
+    single = rows.rows()
+    found = np.array([row[0] for row in single], np.int64)
+    return found, decode_vectors([row[1] for row in single], found, size, bad)
 
 
-def _rows(connection: Connection, ids: Int64Array, encoder: int | None) -> list[tuple[int, bytes]]:
+def _read_rows(connection: Connection, ids: Int64Array, encoder: int | None, into: PackedRows) -> None:
     if not len(ids):
-        return []
+        return
     c = cnn_vectors.c
     query = select(c.keyframe_id, checked.up_to(c.vector, checked.MOST_VECTOR))
     query = query.where(by_own_encoder() if encoder is None else c.model_id == encoder)
     first, last = int(ids[0]), int(ids[-1])
-    if len(ids) >= DENSE * (last - first + 1):
-        keys = set(ids.tolist())
-        with in_bulk(connection), connection.execute(query.where(c.keyframe_id.between(first, last))) as result:
-            if connection.dialect.name == "sqlite":  # reads as rows are asked for, and may fail then
-                return [(row[0], row[1]) for row in result if row[0] in keys]
-            # the driver has all rows, as plain tuples: nothing is to be made of their values
-            return [row for row in result.cursor.fetchall() if row[0] in keys]
-    return [
-        (row[0], row[1])
-        for keys in _in_chunks(ids.tolist())
-        for row in connection.execute(query.where(c.keyframe_id.in_(keys)))
-    ]
+    dense = len(ids) >= DENSE * (last - first + 1)
+    wanted = [c.keyframe_id.between(first, last)] if dense else map(c.keyframe_id.in_, _in_chunks(ids.tolist()))
+    for some in wanted:
+        with in_bulk(connection, into), connection.execute(query.where(some)) as result:
+            # SQLite reads as rows are asked for, and may fail then; a driver of servers has all of them, as plain
+            # tuples: nothing is to be made of their values
+            for row in result if connection.dialect.name == "sqlite" else result.cursor.fetchall():
+                into.add(row[0], row[1])
+    if dense:
+        into.keep(ids)
 
 
-def _without_row(connection: Connection, ids: Int64Array, rows: Sequence[tuple[int, bytes]]) -> list[int]:
+def _without_row(connection: Connection, ids: Int64Array, rows: PackedRows) -> list[int]:
     """Those of `ids` that are there, but not in `rows`: others were deleted a moment ago."""
     if len(rows) == len(ids):
         return []
-    lacking = sorted(set(ids.tolist()) - {row[0] for row in rows})
+    lacking = sorted(set(ids.tolist()) - rows.keys())
     query = select(keyframes.c.id)
     return [
         key

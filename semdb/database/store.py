@@ -296,10 +296,16 @@ class Store:
         return change_log.change_mark(self.engine, map_id, change_id)
 
     def iter_vectors(
-        self, map_id: int, chunk: int = 2000, size: int | None = None, bad: Bad | None = None
+        self,
+        map_id: int,
+        chunk: int = scanning.CHUNK,
+        size: int | None = None,
+        bad: Bad | None = None,
+        *,
+        in_turn: bool = False,
     ) -> Iterator[tuple[Int64Array, Float32Array]]:
         """All vectors of a map in chunks: ids int64 ``[n]``, ascending, and ``[n, d]``: see `scanning.iter_vectors`."""
-        return scanning.iter_vectors(self.engine, map_id, chunk, size, bad)
+        return scanning.iter_vectors(self.engine, map_id, chunk, size, bad, in_turn=in_turn)
 
     def change_text(self, map_id: int, change_id: int) -> str | None:
         """All that the log of changes says in one row; None where there is no such row."""

@@ -80,7 +80,9 @@ class SqlSource:
         shared = self.filtered(query, 0.0, None) if query is not None else Scored(np.empty(0, np.int64), np.empty(0))
         known = dict(zip(shared.keyframe_ids.tolist(), shared.class_scores.tolist(), strict=True))
         best = Ranked(np.empty(0, np.int64), np.empty(0), np.empty(0))
-        for ids, vectors in self._store.iter_vectors(self._map_id, size=len(vector), bad=self._store.left_out):
+        for ids, vectors in self._store.iter_vectors(
+            self._map_id, size=len(vector), bad=self._store.left_out, in_turn=True
+        ):
             scores = np.array([known.get(i, 0.0) for i in ids.tolist()])
             cosines = exact_cosines(vectors, np.arange(len(ids)), vector)
             both = Ranked(

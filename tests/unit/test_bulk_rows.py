@@ -7,12 +7,14 @@ import struct
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymysql import err
 
 from semdb.database import blobs
+from semdb.database.packed import Numbers, PackedRows
 from semdb.threads import ahead
 
 Row = tuple[bytes | None, ...]
@@ -70,9 +72,11 @@ NUMBERS = [("ascii", int), (None, None)]
 OTHERS = [(None, int), (None, None)]  # which are not split by the kernel
 
 
-def read(packets: list[bytes], pieces: list[int], converters: Any = NUMBERS) -> blobs._BulkResult:
+def read(
+    packets: list[bytes], pieces: list[int], converters: Any = NUMBERS, into: PackedRows | Numbers | None = None
+) -> blobs._BulkResult:
     opened = connection(sent(packets), pieces)
-    result = blobs._BulkResult(opened)
+    result = blobs._BulkResult(opened, into)
     result.converters = converters
     result._read_rowdata_packet()
     return result
@@ -92,6 +96,29 @@ def test_rows_are_those_that_were_sent(rows: list[tuple[int, bytes | None]], pie
         result = read(packets, list(pieces), converters)
         assert result.rows == tuple(rows)
         assert (result.affected_rows, result.warning_count, result.has_next) == (len(rows), 3, False)
+    packed = PackedRows()
+    for _ in range(2):  # the second time in the same memory
+        packed.clear()
+        for row in read(packets, list(pieces), into=packed).rows:  # what is no whole number and a blob
+            packed.add(*row)
+        assert len(packed) == len(rows)
+        assert sorted(packed.rows(), key=repr) == sorted(rows, key=repr)
+        assert packed.keys() == {key for key, _ in rows}
+    wanted = np.unique([key for key, _ in rows if key % 2]).astype(np.int64)
+    packed.keep(wanted)
+    assert packed.keys() == set(wanted.tolist())
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.lists(st.integers(-5, 2**63 - 1), max_size=2000), st.lists(st.integers(1, 3000), max_size=50))
+def test_numbers_are_those_that_were_sent(sent_numbers: list[int], pieces: list[int]) -> None:
+    numbers = Numbers()
+    packets = [*wire_of([(str(number).encode(),) for number in sent_numbers]), END]
+    others = read(packets, pieces, [("ascii", int)], numbers).rows
+    numbers.add_many(np.array([number for (number,) in others], np.int64))
+    assert sorted(numbers.all().tolist()) == sorted(sent_numbers)
+    short = [number for number in sent_numbers if 0 <= number < 10**18]
+    assert len(others) == len(sent_numbers) - len(short)
 
 
 def test_a_value_of_more_than_a_packet() -> None:

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from sqlalchemy import BigInteger, Column, MetaData, Table, create_engine, insert, select
 
 from semdb.database import checked
-from semdb.database.codecs import decode_vectors, encode_array
+from semdb.database.codecs import decode_packed, decode_vectors, encode_array
 from semdb.database.exact_sums import exact_sum, whole
+from semdb.database.packed import PackedRows
 from semdb.errors import CodecError
 from semdb.types import Camera
 
@@ -136,6 +137,13 @@ def test_sums_do_not_overflow(values: list[int]) -> None:
     assert whole(row) == sum(values)
 
 
+def packed(blobs: list[Any], room: Any = None) -> Any:
+    rows = PackedRows()
+    for key, blob in enumerate(blobs):
+        rows.add(key, blob)
+    return decode_packed(rows.data, rows.table(), None, room)
+
+
 def test_vectors_that_are_none_are_zero_and_told() -> None:
     rng = np.random.default_rng(0)
     vectors = rng.normal(size=(6, 16)).astype(np.float32)
@@ -143,6 +151,16 @@ def test_vectors_that_are_none_are_zero_and_told() -> None:
     blobs: list[Any] = [encode_array(vector) for vector in vectors]
     keys = np.arange(10, 16)
     np.testing.assert_array_equal(decode_vectors(blobs, keys), vectors)
+    np.testing.assert_array_equal(packed(blobs), vectors)
+    room = np.empty((8, 16), np.float32)
+    assert packed(blobs, room).base is room
+    for number in range(len(blobs[0])):  # each byte of one counts
+        damaged = bytearray(blobs[4])
+        damaged[number] ^= 1 << number % 8
+        assert packed([*blobs[:4], bytes(damaged), blobs[5]]) is None
+    for factor in (np.nan, np.inf, -np.inf, 1.02 / np.abs(vectors[3]).max()):
+        assert packed([*blobs[:3], encode_array(vectors[3] * np.float32(factor))]) is None
+    assert packed([*blobs[:3], encode_array(vectors[3, :15])]) is None
     blobs[1] = encode_array(vectors[1][:5])
     blobs[2] = "text"
     blobs[3] = encode_array(vectors[3] * np.float32(np.nan))

@@ -32,7 +32,7 @@ def load_mirror(
 
     def pieces() -> Iterator[Float32Array]:
         done = 0
-        for ids, vectors in store.iter_vectors(map_id, bad=store.left_out):
+        for ids, vectors in store.iter_vectors(map_id, bad=store.left_out, in_turn=folder is not None):
             read.append(ids)
             yield vectors
             done += len(ids)

@@ -14,8 +14,8 @@ import numpy as np
 from semdb.localization.index.kernels import CodeArray
 from semdb.types import Float32Array
 
-SAMPLE = 8192  # vectors that the components are found from
-ROUNDS = 3  # of the subspace iteration
+SAMPLE = 4096  # vectors that the components are found from
+ROUNDS = 2  # of the subspace iteration
 EXTRA = 16  # components more than asked for while iterating
 LARGEST = 127
 
