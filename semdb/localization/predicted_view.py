@@ -15,6 +15,7 @@ import numpy as np
 
 from semdb.geometry import invert_pose, pose_distances, transform_points
 from semdb.localization.edges import without_distortion
+from semdb.perception.quality import motion_kernel
 from semdb.types import BoolArray, Camera, Float32Array, FloatArray, ImageArray
 
 ACROSS = 213  # pixels
@@ -41,6 +42,7 @@ class SmallView:
     depth: Float32Array | None  # [h, w]
     samples: FloatArray  # [n, 3] some of its points, camera frame
     span: tuple[float, float] = WHOLE  # grey values; what is darker or brighter is not told apart
+    blur: tuple[float, float] | None = None  # pixels and degrees, where motion has blurred it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,9 +55,16 @@ class PlacedView:
 
 
 def small_view(
-    camera: Camera, grey: ImageArray, depth: Float32Array | None = None, stretch: tuple[float, float] | None = None
+    camera: Camera,
+    grey: ImageArray,
+    depth: Float32Array | None = None,
+    stretch: tuple[float, float] | None = None,
+    blur: tuple[float, float] | None = None,
 ) -> SmallView:
-    """Of an image ``[H, W]`` with `depth` ``[H, W]`` metres, as it was seen before its contrast was stretched so."""
+    """Of an image ``[H, W]`` with `depth` ``[H, W]`` metres, as it was seen before its contrast was stretched so.
+
+    `blur`: length (pixels) and direction (degrees) of the motion that has blurred the image.
+    """
     low, high = span = stretch or WHOLE
     seen, small = without_distortion(camera, grey.astype(np.float32), cv2.INTER_LINEAR, ACROSS)
     if stretch is not None:
@@ -63,7 +72,9 @@ def small_view(
     small = np.asarray(cv2.GaussianBlur(small, (0, 0), BLUR), np.float32)
     if depth is not None:
         _, depth = without_distortion(camera, depth, cv2.INTER_NEAREST, ACROSS)
-    return SmallView(np.array([seen.fx, seen.fy, seen.cx, seen.cy]), small, depth, _samples(seen, depth), span)
+    if blur is not None:
+        blur = blur[0] * small.shape[1] / grey.shape[1], blur[1]
+    return SmallView(np.array([seen.fx, seen.fy, seen.cx, seen.cy]), small, depth, _samples(seen, depth), span, blur)
 
 
 def _samples(camera: Camera, depth: Float32Array | None) -> FloatArray:
@@ -142,12 +153,23 @@ def compare_view(
         whole = cv2.erode(there.astype(np.uint8), np.ones((WINDOW, WINDOW), np.uint8), borderValue=0) > 0
         if not whole.any():
             continue
-        shown = np.clip(np.where(there, seen, np.float32(0)), *_span_of(seen[there], query.span))
+        shown = np.where(there, seen, np.float32(0))
+        if query.blur is not None:
+            shown = _blurred(shown, there, query.blur)
+        shown = np.clip(shown, *_span_of(shown[there], query.span))
         like, contrast = _likeness(query.grey, mean, variance, shown, whole, least, reach)
         whole &= contrast
         np.maximum(best, like, out=best, where=whole)
         compared |= whole
     return Windows(best, compared, float(known.mean()))
+
+
+def _blurred(shown: Float32Array, there: BoolArray, blur: tuple[float, float]) -> Float32Array:
+    """What is `there` of an image ``[h, w]``, blurred as motion has blurred another one; the rest is 0."""
+    kernel = motion_kernel(*blur)
+    weight = cv2.filter2D(there.astype(np.float32), -1, kernel, borderType=cv2.BORDER_CONSTANT)
+    smeared = cv2.filter2D(shown, -1, kernel, borderType=cv2.BORDER_CONSTANT)
+    return np.where(there, smeared / np.maximum(weight, np.float32(1e-3)), np.float32(0)).astype(np.float32)
 
 
 def _span_of(shown: Float32Array, span: tuple[float, float]) -> tuple[float, float]:

@@ -19,6 +19,7 @@ from semdb.localization.search import Search
 from semdb.localization.verdict import VerdictOptions
 from semdb.localization.view_search import is_same, search_views
 from semdb.localization.view_step import Seen, Standing, ViewOptions, stand
+from semdb.perception.quality import motion_blur
 from semdb.types import Description, FloatArray
 
 LEAST_PAIRS = 8  # of a keyframe alone, for a pose of its own
@@ -83,7 +84,8 @@ class Viewing:
         """The query's own image, as it was seen."""
         if description.grey is None:
             return None
-        return small_view(description.camera, description.grey, stretch=description.stretch)
+        blur = motion_blur(description.grey)
+        return small_view(description.camera, description.grey, stretch=description.stretch, blur=blur)
 
     def standing(self, search: Search, query: SmallView, description: Description) -> Standing | None:
         """Of all poses that pairs with single keyframes give, the rivals and the pose that was found.

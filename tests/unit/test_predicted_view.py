@@ -12,6 +12,7 @@ from semdb.localization.predicted_view import PlacedView, best_seen, compare_vie
 from semdb.localization.verdict import Judgement, VerdictOptions
 from semdb.localization.view_kernels import fill
 from semdb.localization.view_step import Seen, Standing, ViewOptions, beats, is_like, is_weak, judge_seen, stand
+from semdb.perception.quality import blurred_like
 from semdb.types import Camera, Float32Array, FloatArray, ImageArray, Verdict
 
 CAMERA = Camera(320, 240, 262.0, 262.0, 159.5, 119.5)
@@ -187,3 +188,15 @@ def test_what_a_keyframe_shows_too_coarsely_is_not_known(away: float, known: boo
 )
 def test_which_keypoints_are_weak(values: dict[str, float], weak: bool) -> None:
     assert is_weak(evidence(**values), OPTIONS) is weak
+
+
+def test_an_image_that_motion_has_blurred_looks_like_what_is_predicted_blurred_alike() -> None:
+    blur = (22.0, 30.0)
+    grey = blurred_like(look(shifted(0.0))[0], blur)
+    sharp, alike = (
+        compare_view(small_view(CAMERA, grey, blur=known), shifted(0.0), KEYFRAMES).alike for known in (None, blur)
+    )
+    assert sharp < 0.75
+    assert alike > 0.97
+    there = small_view(CAMERA, grey, blur=blur)
+    assert compare_view(there, shifted(0.15), KEYFRAMES).alike < 0.8  # it still tells another place
