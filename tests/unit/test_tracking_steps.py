@@ -40,7 +40,7 @@ def test_a_step_and_the_turn_during_the_readout_are_found() -> None:
     good, pose, found = solved(*seen(motion, turn), LOOSE)
     assert good
     assert pose_error(pose, motion) == pytest.approx((0, 0), abs=1e-3)
-    np.testing.assert_allclose(found, turn, atol=2e-5)
+    np.testing.assert_allclose(found, turn, atol=5e-5)  # the prior pulls it a little
 
 
 def test_outliers_do_not_move_a_step() -> None:
