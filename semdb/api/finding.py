@@ -128,6 +128,8 @@ def _hit(row: Any, sightings: Sequence[Any], wanted: Wanted) -> FoundLandmark:
         parts["near"] = real("near_score")
     if wanted.on:
         parts["on"] = real("on_score")
+    if wanted.not_near:
+        parts["not_near"] = real("not_near_score")
     parts["state"] = real("state_score")
     if wanted.origin is not None:
         parts["distance"] = real("distance_score")

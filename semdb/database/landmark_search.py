@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, cast
 
 from sqlalchemy import (
     CompoundSelect,
@@ -30,7 +30,7 @@ from sqlalchemy import (
     union_all,
 )
 from sqlalchemy.sql.elements import ColumnElement
-from sqlalchemy.sql.selectable import Subquery
+from sqlalchemy.sql.selectable import FromClause, Subquery
 
 from semdb.database import retry
 from semdb.database.landmark_tables import (
@@ -120,11 +120,25 @@ def statement(wanted: Wanted) -> Select[Any]:
 def _statement(wanted: Shape) -> Select[Any]:
     rows = _placed(wanted) if wanted.near or wanted.on else _all(wanted)
     scored = rows.subquery("scored")
-    s = scored.c
-    score = (s.class_score * s.near_score * s.on_score * s.state_score * s.distance_score).label("score")
+    s, joined = scored.c, cast("FromClause", scored)
+    apart: ColumnElement[Any] = literal(1.0)
+    likely: list[ColumnElement[bool]] = [s.class_score.is_not(None)]
+    if wanted.not_near:
+        there = _related_to("not_near", NEAR, wanted).subquery("there")
+        nearest = (
+            select(there.c.landmark_id, func.max(there.c.sure).label("sure"))
+            .add_columns(func.max(func.coalesce(there.c.sure, there.c.possible)).label("score"))
+            .group_by(there.c.landmark_id)
+            .subquery("nearest")
+        )
+        joined = scored.outerjoin(nearest, nearest.c.landmark_id == s.landmark_id)
+        likely.append(or_(nearest.c.sure.is_(None), nearest.c.sure < NOT_NEAR))
+        apart = 1.0 - func.coalesce(nearest.c.score, 0.0)
+    score = (s.class_score * s.near_score * s.on_score * apart * s.state_score * s.distance_score).label("score")
     best = (
-        select(*s, score)
-        .where(s.class_score.is_not(None))
+        select(*s, apart.label("not_near_score"), score)
+        .select_from(joined)
+        .where(*likely)
         .order_by(score.desc(), s.landmark_id)
         .limit(bindparam("most", type_=Integer))
         .subquery("best")
@@ -154,15 +168,13 @@ def _all(wanted: Shape) -> Select[Any] | CompoundSelect[Any]:
     m, parts = landmarks.c, _parts(wanted)
     rows = select(m.id.label("landmark_id"), m.probability.label("class_score"), *parts)
     rows = rows.where(m.category_id.in_(ids_of("classes")), *conditions(wanted))
-    if wanted.not_near:
-        rows = rows.where(m.id.not_in(_related("not_near", wanted).where(landmark_relations.c.score >= NOT_NEAR)))
     if not wanted.perhaps:
         return rows
     rather = _rather_something_else(wanted)
     others = select(m.id.label("landmark_id"), rather.c.class_score, *parts)
     others = others.select_from(rather.join(landmarks, m.id == rather.c.landmark_id))
     others = others.where(m.category_id.not_in(ids_of("classes")), *conditions(wanted))
-    return union_all(rows, others.where(~_stands_near()) if wanted.not_near else others)
+    return union_all(rows, others)
 
 
 def _placed(wanted: Shape) -> Select[Any]:
@@ -178,27 +190,24 @@ def _placed(wanted: Shape) -> Select[Any]:
     joined = joined.join(landmarks, m.id == first.c.landmark_id)
     is_one = m.category_id.in_(ids_of("classes"))
     likely = case((is_one, m.probability))
-    if wanted.perhaps:
-        rather = _rather_something_else(wanted)
-        joined = joined.outerjoin(rather, rather.c.landmark_id == m.id)
-        likely = case((is_one, m.probability), else_=rather.c.class_score)
+    if wanted.perhaps:  # asked of the few that are no such thing, and not of all of a large map
+        c = landmark_categories.c
+        rather = _perhaps("classes", wanted, _likely()).where(c.landmark_id == m.id).correlate(landmarks)
+        likely = case((is_one, m.probability), else_=rather.scalar_subquery())
     rows = select(m.id.label("landmark_id"), likely.label("class_score"), *_parts(wanted, near, on)).select_from(joined)
-    rows = rows.where(*conditions(replace(wanted, map_id=False)))  # relations are of the map
-    return rows.where(~_stands_near()) if wanted.not_near else rows
+    return rows.where(*conditions(replace(wanted, map_id=False)))  # relations are of the map
 
 
 def _rather_something_else(wanted: Shape) -> Subquery:
-    """Landmarks that are rather of another class, but may be of one that is looked for, and how likely.
-
-    Sums are of whole numbers, so that they do not depend on the order of classes.
-    """
+    """Landmarks that are rather of another class, but may be of one that is looked for, and how likely."""
     c = landmark_categories.c
-    likely = func.sum(func.round(c.probability * UNIT)) / UNIT
-    return (
-        _perhaps("classes", wanted, c.landmark_id, likely.label("class_score"))
-        .group_by(c.landmark_id)
-        .subquery("rather")
-    )
+    found = _perhaps("classes", wanted, c.landmark_id, _likely().label("class_score"))
+    return found.group_by(c.landmark_id).subquery("rather")
+
+
+def _likely() -> ColumnElement[Any]:
+    """How likely it is of one of some classes: a sum of whole numbers, which does not depend on their order."""
+    return func.sum(func.round(landmark_categories.c.probability * UNIT)) / UNIT
 
 
 def _perhaps(names: str, wanted: Shape, *columns: Any, of: Any = landmark_categories) -> Select[Any]:
@@ -207,51 +216,38 @@ def _perhaps(names: str, wanted: Shape, *columns: Any, of: Any = landmark_catego
     return found.where(of.c.map_id == bindparam("map_id")) if wanted.map_id else found
 
 
-def _related(names: str, wanted: Shape, kinds: Sequence[str] = NEAR) -> Select[Any]:
-    """Landmarks of the classes looked for with a relation to any of the classes `names`: one range of an index.
-
-    Of landmarks that are gone there are none.
-    """
-    r = landmark_relations.c
-    found = select(r.landmark_id).where(
-        r.category_id.in_(ids_of("classes")), r.other_category_id.in_(ids_of(names)), r.kind.in_(kinds)
-    )
-    return found.where(r.map_id == bindparam("map_id")) if wanted.map_id else found
-
-
-def _stands_near() -> ColumnElement[bool]:
-    """Whether the landmark of the query around stands near what it should not."""
-    r = landmark_relations.c
-    there = select(literal(1)).where(
-        *(r.landmark_id == landmarks.c.id, r.other_category_id.in_(ids_of("not_near"))),
-        *(r.kind.in_(NEAR), r.score >= NOT_NEAR),
-    )
-    return exists(there.correlate(landmarks))
-
-
 def _relation(names: str, kinds: Sequence[str], wanted: Shape) -> Select[Any]:
     """Landmarks that are looked for, and the highest score of a relation of each to any of the classes `names`.
 
     With `perhaps`, where it has none, one to what may be of them counts as much less as it is less likely.
     """
-    r, other = landmark_relations.c, landmark_categories.alias("other")
-    sure = _related(names, wanted, kinds).add_columns(r.score.label("sure"))
-    if not wanted.perhaps:
-        return sure.with_only_columns(r.landmark_id, func.max(r.score).label("score")).group_by(r.landmark_id)
-    nothing = null().label("possible")
-    rather = landmark_categories.alias("rather_")
-    others = _perhaps("classes", wanted, r.landmark_id, r.score, nothing, of=rather)
-    others = others.select_from(rather.join(landmark_relations, r.landmark_id == rather.c.landmark_id))
-    others = others.where(r.other_category_id.in_(ids_of(names)), r.kind.in_(kinds))
-    either = or_(
-        r.category_id.in_(ids_of("classes")),
-        r.landmark_id.in_(_perhaps("classes", wanted, landmark_categories.c.landmark_id)),
-    )
-    possible = _perhaps(names, wanted, r.landmark_id, null(), r.score * other.c.probability, of=other)
-    possible = possible.select_from(other.join(landmark_relations, r.other_landmark_id == other.c.landmark_id))
-    every = union_all(sure.add_columns(nothing), others, possible.where(r.kind.in_(kinds), either)).subquery("every")
+    every = _related_to(names, kinds, wanted).subquery("every")
     score = func.coalesce(func.max(every.c.sure), func.max(every.c.possible)).label("score")
     return select(every.c.landmark_id, score).group_by(every.c.landmark_id)
+
+
+def _related_to(names: str, kinds: Sequence[str], wanted: Shape) -> Select[Any] | CompoundSelect[Any]:
+    """Landmarks that are looked for with each of their relations to any of the classes `names`: the score as `sure`.
+
+    What of one class stands so to another is one range of an index. With `perhaps` also relations to what may be of
+    them, with their scores times how likely that is as `possible`. Of landmarks that are gone there are none.
+    """
+    r, other = landmark_relations.c, landmark_categories.alias("other")
+    to_them, nothing = (r.other_category_id.in_(ids_of(names)), r.kind.in_(kinds)), null().label("possible")
+    sure = select(r.landmark_id, r.score.label("sure"), nothing).where(r.category_id.in_(ids_of("classes")), *to_them)
+    if wanted.map_id:
+        sure = sure.where(r.map_id == bindparam("map_id"))
+    if not wanted.perhaps:
+        return sure
+    rather = landmark_categories.alias("rather_")
+    others = _perhaps("classes", wanted, r.landmark_id, r.score, nothing, of=rather)
+    others = others.select_from(rather.join(landmark_relations, r.landmark_id == rather.c.landmark_id)).where(*to_them)
+    either: ColumnElement[bool] = r.category_id.in_(ids_of("classes"))
+    if names != "not_near":  # there it changes little of what is little already, at the price of most of the time
+        either = or_(either, r.landmark_id.in_(_perhaps("classes", wanted, landmark_categories.c.landmark_id)))
+    possible = _perhaps(names, wanted, r.landmark_id, null(), r.score * other.c.probability, of=other)
+    possible = possible.select_from(other.join(landmark_relations, r.other_landmark_id == other.c.landmark_id))
+    return union_all(sure, others, possible.where(r.kind.in_(kinds), either))
 
 
 def conditions(wanted: Shape, *, gone: bool = False) -> list[ColumnElement[bool]]:
