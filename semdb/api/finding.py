@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from semdb.landmarks.words import Understood, Vectors
 
 MOST_HITS = 1000
+RATHER = 0.5  # of a relation
 NEVER_SEEN, GONE, NOT_LOOKED_AT = "never_seen", "gone", "not_looked_at"
 
 
@@ -70,7 +71,7 @@ def find(
         found, evidence = rows.search(store.engine, wanted)
     hits = tuple(_hit(row, evidence.get(int(row.landmark_id), []), wanted) for row in found)
     understood: dict[str, Mapping[str, Any]] = {name: item.as_dict() for name, item in meant.items()}
-    missing = None if hits else _missing(store, wanted, meant)
+    missing = None if _is_sure(hits, wanted) else _missing(store, wanted, meant, hits)
     return Found(understood, hits, missing, partial(rows.as_text, store.engine, wanted))
 
 
@@ -189,27 +190,48 @@ def _viewpoint(row: Any) -> Viewpoint | None:
     )
 
 
-def _missing(store: Store, wanted: Wanted, meant: Mapping[str, Understood]) -> Missing:
-    """Which of three it is that nothing was found."""
+def _is_sure(hits: Sequence[FoundLandmark], wanted: Wanted) -> bool:
+    """Whether one of the hits is rather of a class that was asked for than of another, and rather stands so."""
+    parts = [name for name in ("near", "on") if getattr(wanted, name)]
+    return any(hit.category in wanted.classes and all(hit.parts[name] >= RATHER for name in parts) for hit in hits)
+
+
+def _missing(
+    store: Store, wanted: Wanted, meant: Mapping[str, Understood], hits: Sequence[FoundLandmark]
+) -> Missing | None:
+    """Which of three it is that nothing was found, or `hits` that are rather something else; None: they are it."""
     from semdb.database.landmark_unfound import unfound
 
     said = meant["what"].said
     known = unfound(store.engine, wanted)
     usual = tuple({"relation": kind, "category": name, "count": number} for kind, name, number in known.usual)
     there, gone = known.there, known.gone
+    but = "; what was found is rather something else, or near that" if hits else ""
     for part, seen in known.anchors.items():
         if not seen:
-            text = f"no {meant[part].said} was seen, so no place {part} one was looked at"
+            text = f"no {meant[part].said} was seen, so no place {part} one was looked at{but}"
             return Missing(NOT_LOOKED_AT, text, _candidates(there), usual)
     if gone and not there:
-        return Missing(GONE, f"{said}: was seen, and later keyframes see through its place", _candidates(gone), usual)
+        text = f"{said}: was seen, and later keyframes see through its place{but}"
+        return Missing(GONE, text, _candidates(gone), usual)
     if not there:
-        hint = f" ({known.objects} objects are no landmark: run semdb refine)" if known.objects else ""
-        return Missing(NEVER_SEEN, f"{said}: never seen{hint}", (), usual)
+        return Missing(NEVER_SEEN, f"{said}: never seen{_called(known.loose, known.others)}{but}", (), usual)
+    if any(hit.category in wanted.classes for hit in hits):
+        return None  # it stands so, if not surely
     if wanted.seen_after_ns is not None or wanted.seen_in is not None:
-        text = f"{said}: seen, but not since then; where it was has not been seen empty"
+        text = f"{said}: seen, but not since then; where it was has not been seen empty{but}"
         return Missing(NOT_LOOKED_AT, text, _candidates(there), usual)
-    return Missing(NEVER_SEEN, f"{said}: seen, but never so placed", _candidates(there), usual)
+    return Missing(NEVER_SEEN, f"{said}: seen, but never so placed{but}", _candidates(there), usual)
+
+
+def _called(loose: int, others: int) -> str:
+    """What is said of objects that go by a name where no landmark does."""
+    parts = []
+    if loose:
+        parts.append(f"{loose} objects are in no landmark: run semdb refine, unless they have no depth")
+    if others:
+        parts.append(f"{others} objects were called so, of landmarks that are rather something else")
+    return f" ({'; '.join(parts)})" if parts else ""
 
 
 def _candidates(listed: Sequence[Any]) -> tuple[Mapping[str, Any], ...]:

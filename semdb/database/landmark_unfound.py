@@ -1,4 +1,4 @@
-"""What is known of classes of things where a search for them found nothing."""
+"""What is known of classes of things where a search for them found nothing, or nothing that surely is one."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sqlalchemy import Connection, Engine, Integer, Select, bindparam, func, lit
 
 from semdb.database import retry
 from semdb.database.landmark_search import NOT_NEAR, Shape, Wanted, conditions, ids_of, shape_of, values_of
-from semdb.database.landmark_tables import landmark_relations, landmarks
+from semdb.database.landmark_tables import landmark_relations, landmark_sightings, landmarks
 from semdb.database.tables import categories, keyframes, maps, objects, recordings
 
 MOST_LISTED = 5
@@ -23,14 +23,16 @@ class Unfound:
     """What is known of the classes of a search that found nothing.
 
     `there`, `gone`: landmarks of them that are not gone, whatever else was asked, and that are; a few, the last seen
-    first. `anchors`: whether there are landmarks of the classes that it was to stand near, and on. `objects`: how many
-    objects keyframes show of the classes, counted where no landmark is there. `usual`: see `_usual_places`.
+    first. `anchors`: whether there are landmarks of the classes that it was to stand near, and on. `loose`, `others`:
+    how many objects keyframes show of the classes that are in no landmark, and in one of another class, counted where
+    no landmark is there. `usual`: see `_usual_places`.
     """
 
     there: list[Any]
     gone: list[Any]
     anchors: dict[str, bool]
-    objects: int
+    loose: int
+    others: int
     usual: list[tuple[str, str, int]]
 
 
@@ -42,8 +44,8 @@ def unfound(engine: Engine, wanted: Wanted) -> Unfound:
         there, gone = (_listed(connection, plain, gone=gone) for gone in (False, True))
         parts = (("near", wanted.near), ("on", wanted.on))
         known = {name: _any_of(connection, classes, wanted.map_id) for name, classes in parts if classes}
-        number = 0 if there or gone else _objects_of(connection, wanted.classes, wanted.map_id)
-        return Unfound(there, gone, known, number, _usual_places(connection, wanted.classes))
+        loose, others = (0, 0) if there or gone else _objects_of(connection, wanted.classes, wanted.map_id)
+        return Unfound(there, gone, known, loose, others, _usual_places(connection, wanted.classes))
 
     return retry.read(engine, work)
 
@@ -90,13 +92,16 @@ def _any_statement(in_map: bool) -> Select[Any]:
     return found.where(landmarks.c.map_id == bindparam("map_id")) if in_map else found
 
 
-def _objects_of(connection: Connection, names: Sequence[str], map_id: int | None) -> int:
-    """How many objects of these classes keyframes show."""
-    query = select(func.count()).select_from(objects.join(keyframes).join(recordings))
-    query = query.where(objects.c.category_id.in_(ids_of(names)))
+def _objects_of(connection: Connection, names: Sequence[str], map_id: int | None) -> tuple[int, int]:
+    """How many objects of these classes keyframes show: in no landmark, and in one."""
+    placed = func.count(landmark_sightings.c.object_id)
+    joined = objects.join(keyframes).join(recordings)
+    joined = joined.outerjoin(landmark_sightings, landmark_sightings.c.object_id == objects.c.id)
+    query = select(func.count(), placed).select_from(joined).where(objects.c.category_id.in_(ids_of(names)))
     if map_id is not None:
         query = query.where(recordings.c.map_id == map_id)
-    return int(connection.execute(query).scalar() or 0)
+    every, those = connection.execute(query).one()
+    return int(every) - int(those), int(those)
 
 
 def _usual_places(connection: Connection, names: Sequence[str]) -> list[tuple[str, str, int]]:

@@ -58,7 +58,7 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FoundLandmark:
-    """A hit. `parts` are what its `score` is the product of: class, near, on, state, distance."""
+    """A hit. `parts` are what its `score` is the product of: class, near, on, not_near, state, distance."""
 
     landmark_id: int
     map: str
@@ -110,7 +110,9 @@ class FoundLandmark:
 
 @dataclass(frozen=True, slots=True)
 class Missing:
-    """Why nothing was found: `reason` is never_seen, gone or not_looked_at; `usual` says where such things stand."""
+    """Why nothing was found, or nothing that surely is one: `reason` is never_seen, gone or not_looked_at; `usual` says
+    where such things stand.
+    """
 
     reason: str
     text: str
@@ -129,7 +131,10 @@ class Missing:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """The answer of a search. `understood` says of each part of the question which classes it was taken for."""
+    """The answer of a search. `understood` says of each part of the question which classes it was taken for.
+
+    Beside `missing` there are hits where things that are rather something else were found.
+    """
 
     understood: Mapping[str, Mapping[str, Any]]
     hits: tuple[FoundLandmark, ...]

@@ -317,7 +317,7 @@ class Landmark(Model):
 
 
 class Found(Model):
-    """Landmarks that were asked for, the best first; where there is none, `missing` says why."""
+    """Landmarks that were asked for, the best first; where none surely is one, `missing` says why."""
 
     understood: dict[str, dict[str, Any]]
     hits: list[dict[str, Any]]

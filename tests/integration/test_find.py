@@ -122,6 +122,56 @@ def test_a_miss_says_which_of_three_it_is(store: Store, landmarks: list[int]) ->
     assert usual.usual == ({"relation": "on", "category": "dining table", "count": 1},)
 
 
+def test_a_miss_is_told_beside_what_is_rather_something_else(store: Store) -> None:
+    """Every landmark may be a vase, at 0.03: that hides neither that none was seen, nor that one is gone."""
+    map_id, _, _ = fill(store)
+    table, cup, *_ = stored_landmarks(store, map_id)
+
+    def told(what: str, **asked: Any) -> tuple[list[int], str | None]:
+        answer = find(store, what, **asked)
+        return [hit.landmark_id for hit in answer.hits], None if answer.missing is None else answer.missing.text
+
+    but = "; what was found is rather something else, or near that"
+    hits, text_of = told("vase", map="room")
+    assert (len(hits), text_of) == (7, f"vase: never seen{but}")
+    near, text_of = told("chair", near="vase")
+    assert (len(near), text_of) == (1, f"no vase was seen, so no place near one was looked at{but}")
+    assert told("cup", on="table") == ([cup], None)
+    with store.engine.begin() as connection:
+        vase = "(SELECT id FROM categories WHERE name = 'vase')"
+        connection.execute(text(f"UPDATE objects SET category_id = {vase} WHERE id = (SELECT MIN(object_id) FROM "
+                                "landmark_sightings)"))  # fmt: skip
+    _, text_of = told("vase", map="room")
+    assert text_of == f"vase: never seen (1 objects were called so, of landmarks that are rather something else){but}"
+    with store.engine.begin() as connection:
+        connection.execute(text(f"UPDATE landmarks SET state = 'gone', category_id = {vase} WHERE id = {table}"))
+    hits, text_of = told("vase", map="room")
+    assert (len(hits), text_of) == (6, f"vase: was seen, and later keyframes see through its place{but}")
+
+
+def test_how_likely_a_thing_is_of_several_classes_depends_on_no_ids(store: Store) -> None:
+    map_id, _, _ = fill(store)
+    first = stored_landmarks(store, map_id)[0]
+    classes = ("vase", "keyboard", "kite")
+    with store.engine.begin() as connection:
+        for name in classes:
+            connection.execute(text("INSERT INTO categories (name) SELECT :name WHERE NOT EXISTS (SELECT 1 FROM "
+                                    "categories WHERE name = :name)"), {"name": name})  # fmt: skip
+        connection.execute(text("DELETE FROM landmark_categories"))
+    shares, found = (0.1, 0.2, 0.3), []
+    for order in ((0, 1, 2), (2, 1, 0), (1, 2, 0)):  # 0.1 + 0.2 + 0.3 is another number than 0.3 + 0.2 + 0.1
+        with store.engine.begin() as connection:
+            connection.execute(text("DELETE FROM landmark_categories"))
+            for name, k in zip(classes, order, strict=True):
+                query = "INSERT INTO landmark_categories SELECT id, :map, :landmark, :share FROM categories WHERE "
+                values = {"map": map_id, "landmark": first, "share": shares[k], "name": name}
+                connection.execute(text(f"{query} name = :name"), values)
+        wanted = Wanted(classes, map_id=map_id, perhaps=True)
+        with store.engine.connect() as connection:
+            found.append([row.class_score for row in connection.execute(statement(wanted))])
+    assert found == [[0.6]] * 3
+
+
 def test_no_table_is_read_from_end_to_end(store: Store, landmarks: list[int]) -> None:
     with store.engine.begin() as connection:
         columns = "probability, evidence, x, y, z, cov_xx, cov_xy, cov_xz, cov_yy, cov_yz, cov_zz, size_x, size_y, "

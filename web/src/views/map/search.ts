@@ -107,11 +107,13 @@ export class Search {
       .filter(([, item]) => item.how !== "class" || item.classes.join() !== item.said)
       .map(([, item]) => h("p", { class: "faint small" }, texts.search.understood(item.said, item.classes.join(", ") || "–")));
     const clear = h("button", { class: "linklike", attrs: { type: "button" }, on: { click: () => this.clear() } }, texts.search.clear);
+    const hits = this.hits(found.hits.map((hit) => ({ id: hit.landmark, category: hit.category, note: texts.search.score(hit.score) })));
     if (found.missing) {
       const { missing } = found;
       return [
         ...understood,
-        h("div", { class: "miss", attrs: { role: "status" } }, h("strong", null, texts.search.none), h("p", { attrs: { dir: "auto" } }, missing.text)),
+        h("div", { class: "miss", attrs: { role: "status" } }, !found.hits.length && h("strong", null, texts.search.none), h("p", { attrs: { dir: "auto" } }, missing.text)),
+        found.hits.length > 0 && hits,
         missing.candidates.length > 0 && h("p", { class: "small faint" }, texts.search.candidates),
         this.hits(missing.candidates.map((item) => ({ id: item.landmark ?? 0, category: item.category ?? "", note: "" }))),
         missing.usual_places.length > 0 &&
@@ -122,7 +124,7 @@ export class Search {
     return [
       ...understood,
       h("p", { class: "row small" }, h("strong", { class: "grow" }, texts.search.hits(found.hits.length)), clear),
-      this.hits(found.hits.map((hit) => ({ id: hit.landmark, category: hit.category, note: texts.search.score(hit.score) }))),
+      hits,
     ];
   }
 
