@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +18,7 @@ from semdb.landmarks.options import LandmarkOptions
 from semdb.perception.box_masks import box_mask, depth_cluster_mask
 from semdb.recordings.synthetic import SyntheticOptions, SyntheticSequence
 from semdb.recordings.synthetic.mistakes import MISNAMED, make_mistakes, with_misnamed
+from semdb.recordings.synthetic.options import FOCAL_PER_WIDTH
 from semdb.refinement.confusion import MILLION, PlacedObjects, co_detections, confusions
 from semdb.types import BoolArray, Camera, Float32Array, FloatArray, ImageArray
 
@@ -100,12 +101,20 @@ def rooms_parser(what: str | None, rooms: int = 10) -> argparse.ArgumentParser:
     return parser
 
 
-def render_room(seed: int, keyframes: int = 24, width: int = 640, place: int = 0, laps: int = 1) -> RenderedRoom:
-    """The room of a seed, seen from `keyframes` places on `laps` ways round it."""
+def render_room(
+    seed: int,
+    keyframes: int = 24,
+    width: int = 640,
+    place: int = 0,
+    laps: int = 1,
+    height: int | None = None,
+    focal: float = FOCAL_PER_WIDTH,
+) -> RenderedRoom:
+    """The room of a seed, seen from `keyframes` places on `laps` ways round it; `focal` is per width."""
     lap = max(8, keyframes // laps)
-    size = {"width": width, "height": width * 3 // 4}
+    size = {"width": width, "height": height or width * 3 // 4}
     shared = {"frames": keyframes, "lap_frames": lap, "room_seed": seed, "seed": seed, "place": place, **size}
-    return _rendered(SyntheticOptions(**shared))[0]
+    return _rendered(SyntheticOptions(**shared, focal=focal))[0]
 
 
 def render_visit(seed: int, keyframes: int, width: int, taken: float | None) -> RenderedVisit:
@@ -146,15 +155,9 @@ def seen_keyframes(
     names, found, labels = with_misnamed(room.classes), [], []
     for index, frame in enumerate(room.frames):
         rng = np.random.default_rng([room.seed, index, 11])
-        seen = make_mistakes(frame.labels, room.classes, mistakes.missed, mistakes.confused, room.seed, index)
         objects, true = [], []
         depth = frame.noisy if mistakes.depth_noise else frame.depth
-        for label in np.unique(seen[seen > 0]).tolist():
-            mask = seen == label
-            if np.count_nonzero(mask) < SMALLEST:
-                continue
-            if rng.random() < mistakes.cut:
-                mask = cut_mask(mask, rng)
+        for label, mask in _seen_masks(room, index, mistakes, rng):
             objects.append(SeenObject(numbers[names[label]], 0.9, shaped(mask, depth, mistakes.shape)))
             true.append(label % MISNAMED)
         pose = moved_pose(frame.pose, mistakes, rng)
@@ -164,6 +167,29 @@ def seen_keyframes(
         found.append(SeenKeyframe(lifted, category, scores, recording, colours=colours))
         labels.append(true)
     return found, labels
+
+
+def _seen_masks(room: RenderedRoom, index: int, mistakes: Mistakes, rng: Rng) -> Iterator[tuple[int, BoolArray]]:
+    seen = make_mistakes(room.frames[index].labels, room.classes, mistakes.missed, mistakes.confused, room.seed, index)
+    for label in np.unique(seen[seen > 0]).tolist():
+        mask = seen == label
+        if np.count_nonzero(mask) >= SMALLEST:
+            yield label, cut_mask(mask, rng) if rng.random() < mistakes.cut else mask
+
+
+def seen_boxes(room: RenderedRoom, mistakes: Mistakes) -> list[FloatArray]:
+    """Of each keyframe the boxes ``[o, 4]`` (pixels, the last inside) of the objects of `seen_keyframes`."""
+    found = []
+    for index in range(len(room.frames)):
+        masks = _seen_masks(room, index, mistakes, np.random.default_rng([room.seed, index, 11]))
+        found.append(np.array([mask_box(mask) for _, mask in masks], np.float64).reshape(-1, 4))
+    return found
+
+
+def mask_box(mask: BoolArray) -> FloatArray:
+    """x1, y1, x2, y2 ``[4]`` of a mask ``[H, W]`` that is somewhere, the last inside."""
+    v, u = np.nonzero(mask)
+    return np.array([u.min(), v.min(), u.max(), v.max()], np.float64)
 
 
 def confusion_of(keyframes: Sequence[SeenKeyframe], classes: int) -> FloatArray:

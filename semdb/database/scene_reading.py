@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from sqlalchemy import BigInteger, Connection, Engine, cast, func, select
 
 from semdb.database import checked, retry
@@ -12,7 +13,9 @@ from semdb.database.exact_sums import exact_sum
 from semdb.database.landmark_tables import landmark_sightings, landmarks, map_gravity
 from semdb.database.refinements import MICRO, map_state_of, within
 from semdb.database.tables import categories, keyframes, loop_closures, objects, recordings, refinements
+from semdb.types import FloatArray, Int64Array
 
+MOST_PIXELS = 1e6
 _UP = ("up_x", "up_y", "up_z")
 
 
@@ -46,6 +49,24 @@ def sightings_of_landmark(engine: Engine, map_id: int, landmark_id: int) -> list
 def sightings_in_keyframe(engine: Engine, keyframe_id: int) -> list[StoredSighting]:
     """The landmarks that objects of a keyframe show. Raises CodecError for a damaged row."""
     return _read(engine, _statement().where(objects.c.keyframe_id == int(keyframe_id)))
+
+
+def sighting_boxes(engine: Engine, map_id: int) -> tuple[Int64Array, Int64Array, FloatArray]:
+    """Which landmark ``[n]`` of a map which keyframe ``[n]`` shows (ids), and in which boxes ``[n, 4]`` (pixels).
+
+    By landmark and object; a row whose box is damaged is left out.
+    """
+    s, o, m = landmark_sightings.c, objects.c, landmarks.c
+    query = (
+        select(s.landmark_id, o.keyframe_id, o.x1, o.y1, o.x2, o.y2)
+        .select_from(landmark_sightings.join(objects, o.id == s.object_id).join(landmarks, m.id == s.landmark_id))
+        .where(m.map_id == map_id)
+        .order_by(s.landmark_id, s.object_id)
+    )
+    rows = retry.read(engine, lambda c: list(c.execute(query)))
+    kept = [row for row in rows if all(isinstance(value, float) and abs(value) < MOST_PIXELS for value in row[2:])]
+    boxes = np.array([row[2:] for row in kept], np.float64).reshape(-1, 4)
+    return np.array([row[0] for row in kept], np.int64), np.array([row[1] for row in kept], np.int64), boxes
 
 
 def _statement() -> Any:

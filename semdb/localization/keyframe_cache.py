@@ -353,7 +353,7 @@ class KeyframeCache:
         with self._turn:
             if not self._landmarks_read:
                 try:
-                    self._landmarks = read_map_landmarks(self.store, self._map_id, self._read_poses()[1])
+                    self._landmarks = read_map_landmarks(self.store, self._map_id, *self._read_poses())
                 except CodecError:  # those who ask for landmarks are told; an image has its answer without
                     self._landmarks = None
                 self._landmarks_read = True

@@ -15,17 +15,18 @@ from semdb.compiled import kernel
 NEAREST_M = 0.1  # a corner nearer to the camera's plane, or behind it, is taken to be this far before it
 LEAST_INSIDE = 0.25  # of a landmark's box: less in the image is not expected to be seen
 LEAST_SIDE = 0.02  # of a box, at unit distance
-EDGE_SHARE = 0.12  # of the side of a box, by which its edges are off
-EDGE_LEAST = 0.012
+EDGE_LEAST = 0.1  # of the share by which edges are off, at unit distance: what boxes without a side are off
 SIZES = 3.9  # the logarithms of sides of boxes of anything lie in a range so wide
 OUTLIERS = 0.1  # share of boxes of the right thing that are nothing like what is expected
 DEPTH_SHARE = 0.2  # of a landmark's size, by which the middle of what depth shows of it is off
-DEPTH_LEAST = 0.06
+DEPTH_LEAST = 0.03
 DEPTH_BEFORE = 0.15  # of a landmark's size, by which the surface that is seen lies before its middle
 SPREAD = 0.9  # of distances at which a thing is so large, as a share
 REPEATED = 1.2  # a row of books says less than as many different things: what each further one of a name says less
 STRAY = math.log(0.4)  # a thing that the map does not have is so much rarer where the map is than anywhere
 HALF_LOG = 0.5 * math.log(2 * math.pi)
+TAIL = 2.0  # degrees of freedom of Student's distribution, of which edges are off: a mask that is cut has one far off
+MIDDLE = 1 / (2 * math.sqrt(2.0))  # its density there
 MOST_STEPS = 12
 PRIOR = 12  # residuals
 MOST_PULL = 3.0  # standard deviations from which on a residual pulls no harder (Huber)
@@ -58,23 +59,52 @@ def predict(corners: Any, centre: Any, pose: Any, frame: Any, box: Any) -> float
 
 
 @kernel
-def edge_sigma(box: Any, axis: int) -> Any:
-    """How far an edge of a box may be off."""
-    return EDGE_SHARE * max(box[axis + 2] - box[axis], LEAST_SIDE) + EDGE_LEAST
+def edge_sigma(box: Any, axis: int, edge: float) -> Any:
+    """How far an edge of a box may be off, with `edge` the share of a side."""
+    return edge * (max(box[axis + 2] - box[axis], LEAST_SIDE) + EDGE_LEAST)
 
 
 @kernel
-def log_ratio(box: Any, seen: Any, log_area: float) -> float:
+def edges_off(
+    corners: Any,
+    centres: Any,
+    cameras: Any,
+    frame: Any,
+    landmark: Any,
+    camera: Any,
+    boxes: Any,
+    shrunk: float,
+    out: Any,
+) -> None:
+    """How far edges of `boxes` ``[n, 4]`` are off, as `edge_sigma` has it for a share of one: `out` ``[n, 4]``.
+
+    NaN where one is at the border of the image, or the landmark is not in it. `landmark`, `camera` ``[n]`` are rows;
+    boxes of landmarks are those about `corners`, `shrunk`.
+    """
+    box = np.empty(4)
+    for n in range(len(boxes)):
+        m = landmark[n]
+        small = centres[m] + shrunk * (corners[m] - centres[m])
+        out[n] = np.nan
+        if predict(small, centres[m], cameras[camera[n]], frame, box) < LEAST_INSIDE:
+            continue
+        for k in range(4):
+            if abs(boxes[n, k] - frame[k]) > 0.01 and abs(box[k] - frame[k]) > 0.01:
+                out[n, k] = (boxes[n, k] - box[k]) / edge_sigma(box, k % 2, 1.0)
+
+
+@kernel
+def log_ratio(box: Any, seen: Any, log_area: float, edge: float) -> float:
     """Logarithm of how much likelier a box `seen` is of what is expected at `box` than of anything anywhere."""
-    total = 0.0
+    product = 1.0
     for axis in range(2):
-        sigma = edge_sigma(box, axis)
+        sigma = edge_sigma(box, axis, edge)
+        product *= SIZES * max(seen[axis + 2] - seen[axis], LEAST_SIDE)
         for k in (axis, axis + 2):
             off = (seen[k] - box[k]) / sigma
-            total -= 0.5 * off * off + HALF_LOG + math.log(sigma)
-        total += math.log(SIZES) + math.log(max(seen[axis + 2] - seen[axis], LEAST_SIDE))
-    total += log_area
-    return math.log((1 - OUTLIERS) * math.exp(min(total, 300.0)) + OUTLIERS)
+            wide = 1 + off * off / TAIL
+            product *= MIDDLE / (sigma * wide * math.sqrt(wide))
+    return math.log((1 - OUTLIERS) * product * math.exp(log_area) + OUTLIERS)
 
 
 @kernel
@@ -107,6 +137,7 @@ def agreement(
     scores: Any,
     points: Any,
     frame: Any,
+    edge: float,
     pose: Any,
     assigned: Any,
     table: Any,
@@ -130,7 +161,7 @@ def agreement(
         missed = math.log(1 - expected)
         total += missed
         for d in range(number):
-            ratio = log_ratio(box, boxes[d], log_area) + depth_ratio(centres[m], reach[m], pose, points[d])
+            ratio = log_ratio(box, boxes[d], log_area, edge) + depth_ratio(centres[m], reach[m], pose, points[d])
             gain = math.log(expected) + names[m, d] + ratio
             # a detection that the detector is not sure of says as much less
             table[m, d] = math.log(scores[d] * math.exp(min(gain - missed, 300.0)) + 1 - scores[d])
@@ -172,6 +203,7 @@ def agreements(
     scores: Any,
     points: Any,
     frame: Any,
+    edge: float,
     poses: Any,
     found: Any,
 ) -> None:
@@ -180,13 +212,35 @@ def agreements(
     table = np.empty((len(centres), len(boxes)))
     for n in range(len(poses)):
         found[n] = agreement(
-            corners, centres, reach, seen, names, boxes, category, scores, points, frame, poses[n], assigned, table
+            corners,
+            centres,
+            reach,
+            seen,
+            names,
+            boxes,
+            category,
+            scores,
+            points,
+            frame,
+            edge,
+            poses[n],
+            assigned,
+            table,
         )
 
 
 @kernel
 def residuals(
-    corners: Any, centres: Any, reach: Any, boxes: Any, points: Any, frame: Any, pose: Any, assigned: Any, out: Any
+    corners: Any,
+    centres: Any,
+    reach: Any,
+    boxes: Any,
+    points: Any,
+    frame: Any,
+    edge: float,
+    pose: Any,
+    assigned: Any,
+    out: Any,
 ) -> int:
     """In standard deviations, five of each landmark that has a box: its edges and its distance. Returns how many."""
     box = np.empty(4)
@@ -200,7 +254,7 @@ def residuals(
             row += 5
             continue
         for k in range(4):
-            sigma = edge_sigma(box, k % 2)
+            sigma = edge_sigma(box, k % 2, edge)
             at_border = abs(boxes[d, k] - frame[k]) < 0.01 and abs(box[k] - frame[k]) < 0.01
             out[row + k] = 0.0 if at_border else (boxes[d, k] - box[k]) / sigma
         out[row + 4] = 0.0
@@ -255,10 +309,12 @@ def prior_residuals(pose: Any, start: Any, level: Any, widths: Any, out: Any) ->
 
 
 @kernel
-def cost(values: Any, count: int) -> float:
-    """Half the sum of squares, straight beyond `MOST_PULL`."""
+def cost(values: Any, count: int, edges: int) -> float:
+    """Of residuals: Student's of the first `edges`, half the sum of squares of the others, straight far out."""
     total = 0.0
-    for k in range(count):
+    for k in range(edges):
+        total += 0.5 * (TAIL + 1) * math.log(1 + values[k] * values[k] / TAIL)
+    for k in range(edges, count):
         a = abs(values[k])
         total += 0.5 * a * a if a < MOST_PULL else MOST_PULL * (a - 0.5 * MOST_PULL)
     return total
@@ -272,6 +328,7 @@ def refine(
     boxes: Any,
     points: Any,
     frame: Any,
+    edge: float,
     start: Any,
     level: Any,
     widths: Any,
@@ -293,22 +350,25 @@ def refine(
     other = np.empty((4, 4))
     step = np.empty(6)
     damping = 1e-3
-    residuals(corners, centres, reach, boxes, points, frame, pose, assigned, here)
+    residuals(corners, centres, reach, boxes, points, frame, edge, pose, assigned, here)
     prior_residuals(pose, start, level, widths, here[size - PRIOR :])
-    value = cost(here, size)
+    value = cost(here, size, size - PRIOR)
     for _ in range(MOST_STEPS):
         for k in range(6):
             step[:] = 0.0
             step[k] = 1e-4
             moved(pose, step, other)
-            residuals(corners, centres, reach, boxes, points, frame, other, assigned, there)
+            residuals(corners, centres, reach, boxes, points, frame, edge, other, assigned, there)
             prior_residuals(other, start, level, widths, there[size - PRIOR :])
             for n in range(size):
                 jacobian[n, k] = (there[n] - here[n]) / 1e-4
         information[:] = 0.0
         gradient = np.zeros(6)
         for n in range(size):
-            weight = 1.0 if abs(here[n]) < MOST_PULL else MOST_PULL / abs(here[n])
+            if n < size - PRIOR:
+                weight = (TAIL + 1) / (TAIL + here[n] * here[n])
+            else:
+                weight = 1.0 if abs(here[n]) < MOST_PULL else MOST_PULL / abs(here[n])
             for r in range(6):
                 gradient[r] += weight * jacobian[n, r] * here[n]
                 for c in range(6):
@@ -320,9 +380,9 @@ def refine(
                 damped[k, k] += damping * (information[k, k] + 1e-9)
             step[:] = -np.linalg.solve(damped, gradient)
             moved(pose, step, other)
-            residuals(corners, centres, reach, boxes, points, frame, other, assigned, there)
+            residuals(corners, centres, reach, boxes, points, frame, edge, other, assigned, there)
             prior_residuals(other, start, level, widths, there[size - PRIOR :])
-            found = cost(there, size)
+            found = cost(there, size, size - PRIOR)
             if found < value:
                 better = value - found > 1e-4
                 pose[:] = other
@@ -333,4 +393,4 @@ def refine(
             damping *= 5
         if not better:
             break
-    return cost(here[size - PRIOR :], PRIOR)
+    return cost(here[size - PRIOR :], PRIOR, 0)

@@ -32,6 +32,7 @@ class LandmarkPoseOptions:
     ways_to_hold: int = 6  # the camera
     distance_slack: float = 0.35  # by which distances judged by size may be wrong, as a share
     refined: int = 24  # hypotheses
+    wide: float = 3.0  # times as much, where hypotheses are compared that are not refined
     # how far an image is from the nearest keyframe: of up and of level axes in the camera (rad), of its place along
     # level axes and in height (m); beyond three of these it costs little more
     widths: tuple[float, float, float, float] = (0.08, 0.25, 0.2, 0.12)
@@ -41,7 +42,7 @@ class LandmarkPoseOptions:
     elsewhere_m: float = 0.7
     elsewhere_deg: float = 20.0
     least_trust: float = 0.8
-    covariance_scale: float = 3.0
+    covariance_scale: float = 1.6
     usual_residuals: float = 20.0  # of one standard deviation, that are added to those of an image
     most_sigma_m: float = 0.7
     most_sigma_deg: float = 17.0
@@ -59,6 +60,7 @@ class MapLandmarks:
     seen: FloatArray  # [l] how likely a landmark is found where it lies in the image
     cameras: FloatArray  # [k, 4, 4] camera_from_world of keyframes
     level: FloatArray  # [3, 3] columns: two level axes, and up
+    edge: float  # the share of the side of a box by which its edges are off
 
     @property
     def reach(self) -> FloatArray:
@@ -93,7 +95,6 @@ class LandmarkPose:
     lead: float  # over the best pose elsewhere
     matched: int
     expected: int  # landmarks that lie in the image
-    overlap: float  # sum over matched landmarks of how far their boxes are those that are seen (IoU)
     sureness: float  # mean score of the detections
     measured: bool  # whether depth has places of things
     sigma_m: float
@@ -103,12 +104,12 @@ class LandmarkPose:
     def trust(self) -> float:
         """The probability that the pose is right rather than of another place, as fitted.
 
-        Detections that are all of one high score, as masks that a recording brings are, overrate how much they say; and
-        boxes that only half agree are what another place gives, too.
+        Detections that are all of one high score, as masks that a recording brings are, overrate how much they say, and
+        their distances still more.
         """
         sure = (self.sureness - 0.6) / 0.3
-        value = self.score * (2.53 - 1.12 * sure) / 10 + 1.51 * min(max(self.lead, 0.0), 25.0) / 10 - 0.51 * sure
-        value += 2.43 * self.overlap / 5 + 2.84 * self.overlap / max(self.matched, 1) - 7.79
+        value = self.score * (2.05 - 0.64 * sure) / 10 + 1.19 * float(np.log1p(max(self.lead, 0.0)))
+        value -= (1.32 + 0.93 * self.measured) * sure + 5.41
         return float(1 / (1 + np.exp(-value)))
 
     def doubt(self, options: LandmarkPoseOptions) -> str:
@@ -152,11 +153,11 @@ def things_of(
     keep = keep[np.argsort(-scores[keep], kind="stable")][: options.most_detections]
     edges = np.array([[-0.5, -0.5, camera.width - 0.5, camera.height - 0.5]])
     grown = boxes[keep] + np.array([-0.5, -0.5, 0.5, 0.5])
-    plane = _unit_boxes(camera, np.concatenate([grown, edges]))
+    plane = unit_boxes(camera, np.concatenate([grown, edges]))
     return SeenThings(plane[:-1], known[keep], np.clip(scores[keep], 0.01, 0.98), points[keep], plane[-1])
 
 
-def _unit_boxes(camera: Camera, boxes: FloatArray) -> FloatArray:
+def unit_boxes(camera: Camera, boxes: FloatArray) -> FloatArray:
     """Boxes in pixels at unit distance: the middles of their sides, without the lens."""
     x1, y1, x2, y2 = boxes.T
     mx, my = (x1 + x2) / 2, (y1 + y2) / 2
@@ -181,7 +182,6 @@ def find_pose(things: SeenThings, landmarks: MapLandmarks, options: LandmarkPose
         lead=best.score - max(others, default=0.0),
         matched=int(np.count_nonzero(best.assigned >= 0)),
         expected=search.expected(best.pose),
-        overlap=search.overlap(best),
         sureness=float(things.scores.mean()),
         measured=bool(np.isfinite(things.points).any()),
         sigma_m=float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])),
@@ -225,7 +225,7 @@ class _Search:
     def likeliest(self) -> list[int]:
         """The hypotheses that agree best, none of them close to a better one."""
         scores = np.empty(len(self._starts))
-        kernels.agreements(*self._given, self._starts, scores)
+        kernels.agreements(*self._given, self._options.wide * self._landmarks.edge, self._starts, scores)
         order = np.argsort(-scores, kind="stable")[: 20 * self._options.refined]
         places, looks = _places(self._starts[order]), self._starts[order, 2, :3]
         chosen: list[int] = []
@@ -243,13 +243,14 @@ class _Search:
         information = np.zeros((6, 6))
         nearest = self._nearest(pose)
         level = self._landmarks.level
-        score = kernels.agreement(*self._given, pose, assigned, self._table)
-        away = 0.0
-        for _ in range(3):
+        edge, away = self._options.wide * self._landmarks.edge, 0.0
+        score = kernels.agreement(*self._given, edge, pose, assigned, self._table)
+        for turn in range(4):
             before = assigned.copy()
-            away = kernels.refine(*self._fitted, nearest, level, self._widths, assigned, pose, information)
-            score = kernels.agreement(*self._given, pose, assigned, self._table)
-            if np.array_equal(before, assigned):
+            away = kernels.refine(*self._fitted, edge, nearest, level, self._widths, assigned, pose, information)
+            edge = self._landmarks.edge
+            score = kernels.agreement(*self._given, edge, pose, assigned, self._table)
+            if turn and np.array_equal(before, assigned):
                 break
         return _Refined(float(score - self._options.near_weight * away), pose, assigned, information)
 
@@ -268,25 +269,10 @@ class _Search:
     def looseness(self, found: _Refined) -> float:
         """How much larger than one the squared residuals are, with usual ones: boxes of some images fit better."""
         off = np.zeros(5 * max(int(np.count_nonzero(found.assigned >= 0)), 1))
-        count = kernels.residuals(*self._fitted, found.pose, found.assigned, off)
+        count = kernels.residuals(*self._fitted, self._landmarks.edge, found.pose, found.assigned, off)
         off = np.minimum(np.abs(off[:count]), kernels.MOST_PULL)
         usual = self._options.usual_residuals
         return float((usual + (off * off).sum()) / (usual + np.count_nonzero(off)))
-
-    def overlap(self, found: _Refined) -> float:
-        """The sum of the intersections over union of expected and seen boxes of what is matched."""
-        box, of, total = np.empty(4), self._landmarks, 0.0
-        for m in np.flatnonzero(found.assigned >= 0).tolist():
-            kernels.predict(of.corners[m], of.centres[m], found.pose, self._things.frame, box)
-            total += intersection_over_union(box, self._things.boxes[found.assigned[m]])
-        return total
-
-
-def intersection_over_union(one: FloatArray, other: FloatArray) -> float:
-    """Of two boxes ``[4]``: x1, y1, x2, y2."""
-    low, high = np.maximum(one[:2], other[:2]), np.minimum(one[2:], other[2:])
-    shared = float(np.prod(np.maximum(high - low, 0)))
-    return shared / max(float(np.prod(one[2:] - one[:2]) + np.prod(other[2:] - other[:2])) - shared, 1e-12)
 
 
 def _places(cameras: FloatArray) -> FloatArray:

@@ -13,6 +13,7 @@ from sqlalchemy import text
 
 from semdb.database.landmark_rows import LANDMARKS, give_up, load_gravity
 from semdb.database.records import KeyframeRecord, MapInfo, RecordingPlan
+from semdb.database.scene_reading import sighting_boxes
 from semdb.database.store import Store, open_store
 from semdb.landmarks.identity import keep_ids
 from semdb.perception.describe import Describer
@@ -224,3 +225,14 @@ def test_damaged_rows_are_left_out_aloud(store: Store) -> None:
     assert any("objects.mask" in line for line in said)
     shown = {sighting[1] for sightings in things(store).values() for sighting in sightings}
     assert shown == {0, 3}
+    known = {head.id: head.frame_index for head in store.keyframe_heads(info.id)}
+    landmark, keyframe, boxes = sighting_boxes(store.engine, info.id)
+    rows = sum(len(sightings) for sightings in things(store).values())
+    assert landmark.tolist() == sorted(landmark.tolist())
+    assert {known[one] for one in keyframe.tolist()} == shown
+    assert boxes.shape == (rows, 4)
+    with store.engine.begin() as connection:
+        connection.execute(text("UPDATE objects SET x1 = 1e9 WHERE keyframe_id = :key"), {"key": heads[3]})
+    left = sighting_boxes(store.engine, info.id)
+    assert {known[one] for one in left[1].tolist()} == {0}
+    assert (boxes[:, 2:] >= boxes[:, :2]).all()

@@ -10,7 +10,7 @@ from semdb.geometry import invert_pose, pose_error, so3_exp
 from semdb.localization.landmark_kernels import LEAST_INSIDE, PRIOR, predict, refine
 from semdb.localization.landmark_pose import LandmarkPoseOptions, MapLandmarks, SeenThings, find_pose, things_of
 from semdb.localization.landmark_step import landmark_pose, things_in
-from semdb.localization.map_landmarks import map_landmarks
+from semdb.localization.map_landmarks import EDGE, LOOSER, MEDIAN, MOST_EDGE, SHRUNK, SightingBoxes, map_landmarks
 from semdb.types import Camera, Description, Detection, Float32Array, FloatArray, ObjectGeometry
 from tests.unit.localization_scene import Scene
 
@@ -120,6 +120,41 @@ def test_a_symmetric_room_is_refused() -> None:
     assert sure.doubt(OPTIONS) == ""
 
 
+@pytest.mark.parametrize("off", [0.015, 0.03, 0.2])
+def test_keyframes_tell_how_far_boxes_are_off(off: float) -> None:
+    """Boxes of things that fill 0.96 of their landmarks' boxes, their edges off by so much of their sides."""
+    rng, known = np.random.default_rng(5), [thing(k, NAMES[k % 8], place_of(k), (0.3, 0.3, 0.3)) for k in range(24)]
+    whole = map_landmarks(known, KEYFRAMES, UP, CAMERA, {})
+    assert whole is not None
+    assert whole.edge == EDGE
+    box, frame, rows = np.empty(4), seen_from(whole, KEYFRAMES[0], 0, depth=False).frame, []
+    for keyframe, pose in enumerate(whole.cameras):
+        for m, centre in enumerate(whole.centres):
+            corners = centre + 0.96 / SHRUNK * (whole.corners[m] - centre)
+            if predict(corners, centre, pose, frame, box) == 1:
+                sides = np.tile(box[2:] - box[:2], 2) + 0.1
+                pixels = (box + off * sides * rng.choice([-1, 1], 4)) * 520 + [319.5, 239.5, 319.5, 239.5]
+                rows.append((m, keyframe, pixels + np.array([0.5, 0.5, -0.5, -0.5])))
+    landmark, keyframes = np.array([row[:2] for row in rows]).T
+    seen = SightingBoxes(landmark, keyframes, np.array([row[2] for row in rows]))
+    found = map_landmarks(known, KEYFRAMES, UP, CAMERA, {}, seen)
+    assert found is not None
+    if off < 0.1:
+        assert np.allclose(
+            found.corners, whole.centres[:, None] + 0.96 / SHRUNK * (whole.corners - whole.centres[:, None])
+        )
+    assert found.edge == pytest.approx(min(LOOSER * off / MEDIAN, MOST_EDGE), rel=0.05)
+    few = SightingBoxes(landmark[:9], keyframes[:9], seen.boxes[:9])
+    sparse = map_landmarks(known, KEYFRAMES, UP, CAMERA, {}, few)
+    assert sparse is not None
+    assert sparse.edge == EDGE
+
+
+def place_of(number: int) -> FloatArray:
+    angle = np.pi / 12 * number
+    return np.array([2.5 * np.cos(angle), 2.5 * np.sin(angle), 0.9])
+
+
 def test_the_same_answer_twice_and_nothing_to_go_by() -> None:
     landmarks = room(1)
     things = seen_from(landmarks, KEYFRAMES[2], 5, depth=False)
@@ -150,7 +185,7 @@ def test_refining_moves_to_where_boxes_agree() -> None:
     information = np.zeros((6, 6))
     loose = np.full(4, 100.0)
     points = np.full((len(boxes), 3), np.nan)
-    given = (landmarks.corners, landmarks.centres, landmarks.reach, np.array(boxes), points, frame)
+    given = (landmarks.corners, landmarks.centres, landmarks.reach, np.array(boxes), points, frame, landmarks.edge)
     away = refine(*given, camera.copy(), landmarks.level, loose, assigned, start, information)
     metres, degrees = pose_error(invert_pose(start), true)
     assert metres < 0.01

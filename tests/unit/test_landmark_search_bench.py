@@ -11,7 +11,6 @@ from bench.landmarks.together import names_of
 from semdb.geometry import rotation_angle_deg, so3_exp
 from semdb.landmarks.boxes import Box
 from semdb.landmarks.evidence import fuse, name_probabilities, perhaps
-from semdb.localization.landmark_pose import intersection_over_union
 from semdb.localization.landmark_starts import TURNS, turned_cameras
 
 
@@ -69,13 +68,6 @@ def test_keyframes_look_aside_from_where_they_are() -> None:
     assert max(angles) < 20
     assert len(turned_cameras(np.repeat(camera[None], 400, axis=0), np.eye(3), 1200)) == 1200
     assert len(turned_cameras(np.repeat(camera[None], 1300, axis=0), np.eye(3), 1200)) == 0
-
-
-def test_overlap_of_boxes() -> None:
-    one = np.array([0.0, 0.0, 2.0, 1.0])
-    assert intersection_over_union(one, one) == pytest.approx(1)
-    assert intersection_over_union(one, one + np.array([1, 0, 1, 0])) == pytest.approx(1 / 3)
-    assert intersection_over_union(one, one + 5) == 0
 
 
 def test_what_a_thing_may_be_is_what_it_was_called() -> None:
