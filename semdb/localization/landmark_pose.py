@@ -43,6 +43,7 @@ class LandmarkPoseOptions:
     elsewhere_deg: float = 20.0
     least_trust: float = 0.8
     covariance_scale: float = 1.6
+    sure: float = 0.9  # mean score of detections for which that holds
     usual_residuals: float = 20.0  # of one standard deviation, that are added to those of an image
     most_sigma_m: float = 0.7
     most_sigma_deg: float = 17.0
@@ -174,7 +175,9 @@ def find_pose(things: SeenThings, landmarks: MapLandmarks, options: LandmarkPose
     found = sorted((search.refine(k) for k in search.likeliest()), key=lambda one: -one.score)
     best = found[0]
     others = [one.score for one in found[1:] if _is_elsewhere(one.pose, best.pose, options)]
-    covariance = _covariance(best.pose, best.information, options) * search.looseness(best)
+    sureness = float(things.scores.mean())
+    looser = search.looseness(best) * options.sure / sureness  # what a detector is less sure of it also cuts out worse
+    covariance = _covariance(best.pose, best.information, options) * looser
     return LandmarkPose(
         world_from_camera=invert_pose(best.pose),
         covariance=covariance,
@@ -182,7 +185,7 @@ def find_pose(things: SeenThings, landmarks: MapLandmarks, options: LandmarkPose
         lead=best.score - max(others, default=0.0),
         matched=int(np.count_nonzero(best.assigned >= 0)),
         expected=search.expected(best.pose),
-        sureness=float(things.scores.mean()),
+        sureness=sureness,
         measured=bool(np.isfinite(things.points).any()),
         sigma_m=float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])),
         sigma_deg=float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))),
