@@ -26,7 +26,7 @@ BEFORE = "ix_landmark_relations_other_landmark_id_kind"
 
 
 def upgrade() -> None:
-    there = {column["name"] for column in sa.inspect(op.get_bind()).get_columns(TABLE)}
+    there = _columns()
     for name in COLUMNS:  # an upgrade that was cut off on a server goes on here
         if name not in there:
             op.add_column(TABLE, sa.Column(name, Id, nullable=True))
@@ -43,12 +43,20 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    if BEFORE not in _indexes():
+    known = _indexes()  # one that was cut off on a server goes on here, too
+    if BEFORE not in known:
         op.create_index(BEFORE, TABLE, ["other_landmark_id", "kind"])
     for name in INDEXES:
-        op.drop_index(name, TABLE)
+        if name in known:
+            op.drop_index(name, TABLE)
+    there = _columns()
     for name in COLUMNS:
-        op.drop_column(TABLE, name)
+        if name in there:
+            op.drop_column(TABLE, name)
+
+
+def _columns() -> set[str]:
+    return {column["name"] for column in sa.inspect(op.get_bind()).get_columns(TABLE)}
 
 
 def _indexes() -> set[str | None]:

@@ -216,12 +216,19 @@ def _missing(
         return Missing(GONE, text, _candidates(gone), usual)
     if not there:
         return Missing(NEVER_SEEN, f"{said}: never seen{_called(known.loose, known.others)}{but}", (), usual)
-    if any(hit.category in wanted.classes for hit in hits):
+    if any(hit.category in wanted.classes for hit in hits) or _is_cut_off(store, wanted, hits):
         return None  # it stands so, if not surely
     if wanted.seen_after_ns is not None or wanted.seen_in is not None:
         text = f"{said}: seen, but not since then; where it was has not been seen empty{but}"
         return Missing(NOT_LOOKED_AT, text, _candidates(there), usual)
     return Missing(NEVER_SEEN, f"{said}: seen, but never so placed{but}", _candidates(there), usual)
+
+
+def _is_cut_off(store: Store, wanted: Wanted, hits: Sequence[FoundLandmark]) -> bool:
+    """Whether one that is of a class that was asked for comes after the last of so many hits."""
+    from semdb.database import landmark_search as rows
+
+    return len(hits) == wanted.limit and bool(rows.search(store.engine, replace(wanted, perhaps=False, limit=1))[0])
 
 
 def _called(loose: int, others: int) -> str:

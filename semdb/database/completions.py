@@ -81,8 +81,8 @@ def replace_completions(
     if added:
         connection.execute(insert(map_completions), {"map_id": map_id, "map_state": state or ""})
         rows = [row for key in sorted(after) for row in _rows(map_id, key, after[key])]
-    stored = select(completed_categories).where(completed_categories.c.map_id == map_id)
-    write_groups(connection, completed_categories, "keyframe_id", stored, rows)
+    own = completed_categories.c.map_id == map_id  # a keyframe that was moved has rows of two maps
+    write_groups(connection, completed_categories, "keyframe_id", select(completed_categories).where(own), rows, own)
     changed = set(added)
     if before_state == state:  # who opened the map while this step was forgotten knows of none
         changed |= {key for key, found in before.items() if key in seen and found != seen[key]}

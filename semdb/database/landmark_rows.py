@@ -170,6 +170,9 @@ def replace_landmarks(connection: Connection, map_id: int, found: LandmarkSet, k
             ids.append(key)
             told.append({**values, "id": key})
     update_rows(connection, landmarks, select(landmarks).where(c.map_id == map_id), told)
+    taken = {s.object_id for row in found.landmarks for s in row.sightings} - old.keys()
+    # of a recording that was moved here, sightings of landmarks of the map that it came from
+    delete_keys(connection, landmark_sightings, landmark_sightings.c.object_id, sorted(taken))
     for table, group, rows in _rows_beside(connection, map_id, found, ids, known):
         stored = select(table).join(landmarks, c.id == table.c.landmark_id).where(c.map_id == map_id)
         write_groups(connection, table, group, stored, rows)

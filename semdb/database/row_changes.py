@@ -12,16 +12,19 @@ CHUNK = 500  # rows of a statement
 Rows = Sequence[Mapping[str, Any]]
 
 
-def write_groups(connection: Connection, table: Table, group: str, stored: Select[Any], wanted: Rows) -> None:
+def write_groups(
+    connection: Connection, table: Table, group: str, stored: Select[Any], wanted: Rows, *own: ColumnElement[bool]
+) -> None:
     """Makes the rows of `table` that `stored` selects (all columns) those of `wanted`.
 
-    Rows belong together by the column `group`: where one of a group differs, all of it are written anew.
+    Rows belong together by the column `group`: where one of a group differs, all of it are written anew. Where rows
+    of a group may be there that `stored` does not select, `own` are the conditions that tell its rows from them.
     """
     names = [column.name for column in table.columns]
     there = _grouped(map(tuple, connection.execute(stored)), names.index(group))
     new = _grouped((tuple(row[name] for name in names) for row in wanted), names.index(group))
     changed = {key for key in there.keys() | new.keys() if set(there.get(key, ())) != set(new.get(key, ()))}
-    delete_keys(connection, table, table.c[group], sorted(changed & there.keys()))
+    delete_keys(connection, table, table.c[group], sorted(changed & there.keys()), *own)
     rows = [dict(zip(names, row, strict=True)) for key in sorted(changed & new.keys()) for row in new[key]]
     insert_rows(connection, table, rows)
 
@@ -40,10 +43,12 @@ def update_rows(connection: Connection, table: Table, stored: Select[Any], wante
             connection.execute(query, values[start : start + CHUNK])
 
 
-def delete_keys(connection: Connection, table: Table, column: ColumnElement[Any], keys: Sequence[Any]) -> None:
-    """Deletes the rows of `table` with these values of `column`, in statements of bounded size."""
+def delete_keys(
+    connection: Connection, table: Table, column: ColumnElement[Any], keys: Sequence[Any], *own: ColumnElement[bool]
+) -> None:
+    """Deletes the rows of `table` with these values of `column`, where `own` holds, in bounded statements."""
     for start in range(0, len(keys), CHUNK):
-        connection.execute(delete(table).where(column.in_(keys[start : start + CHUNK])))
+        connection.execute(delete(table).where(column.in_(keys[start : start + CHUNK]), *own))
 
 
 def insert_rows(connection: Connection, table: Table, rows: Rows) -> None:

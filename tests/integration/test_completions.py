@@ -14,6 +14,8 @@ from sqlalchemy import select, text
 from semdb.class_score import strength_query
 from semdb.database.completions import STEP, replace_completions
 from semdb.database.landmark_records import CompletedClass
+from semdb.database.moving import move
+from semdb.database.pose_records import Move, MovedRecording, OperationKind
 from semdb.database.records import ScoredKeyframe
 from semdb.database.refinements import forget
 from semdb.database.store import Store, open_store
@@ -62,6 +64,24 @@ def filled(store: Store) -> tuple[int, list[int]]:
     ids = [store.write_keyframe(planned.recording_id, one).keyframe_id for one in made]
     fill(store, "another map", seed=77)
     return map_id, ids
+
+
+def test_what_a_map_had_of_a_keyframe_that_was_moved_is_not_what_its_new_map_has(tmp_path: Path) -> None:
+    with open_store(f"sqlite:///{tmp_path}/m.sqlite3", create=True) as store:
+        old, new = store.ensure_map("own"), store.ensure_map("room")
+        recording = store.plan_recording(old, plan("r", range(2)), MODELS).recording_id
+        made = [record(i, description(i, ["chair", "cup"][: i + 1], keypoints=3)) for i in range(2)]
+        ids = [store.write_keyframe(recording, one).keyframe_id for one in made]
+        found = [CompletedClass(ids[0], "cup", 0, 40)]
+        complete(store, old, found)
+        poses = dict(zip(*store.poses(old), strict=True))
+        moved = MovedRecording(recording, old, "moved", np.eye(4))
+        move(store.engine, Move(OperationKind.ALIGN, new, poses, poses, (moved,)))
+        complete(store, new, found)
+        both = rows(store)
+        complete(store, old, [])  # which has no keyframes any more
+        assert (len(both), rows(store)) == (8, sorted(set(both)))
+        assert store.completion_of(new) == store.map_state(new)
 
 
 def test_what_is_missed_counts_until_the_map_changes(store: Store, filled: tuple[int, list[int]]) -> None:

@@ -149,6 +149,23 @@ def test_a_miss_is_told_beside_what_is_rather_something_else(store: Store) -> No
     assert (len(hits), text_of) == (6, f"vase: was seen, and later keyframes see through its place{but}")
 
 
+def test_what_comes_after_the_last_hit_is_not_said_to_miss(tmp_path: Path) -> None:
+    with open_store(f"sqlite:///{tmp_path}/m.sqlite3", create=True) as store:
+        map_id, _, _ = fill(store)
+        _, cup, *_, other_cup, banana, _ = stored_landmarks(store, map_id)
+        with store.engine.begin() as connection:
+            query = "UPDATE landmark_categories SET probability = 0.9, category_id = (SELECT id FROM categories "
+            connection.execute(text(f"{query} WHERE name = 'cup') WHERE landmark_id = {banana}"))
+            connection.execute(text(f"UPDATE landmarks SET state = 'tentative' WHERE id IN ({cup}, {other_cup})"))
+        for limit in (1, 2):
+            answer = find(store, "cup", map="room", limit=limit)
+            assert [hit.landmark_id for hit in answer.hits] == [banana, cup][:limit]
+            assert answer.missing is None
+        placed = find(store, "cup", map="room", near="book", limit=1).missing
+        assert placed is not None
+        assert placed.text == "cup: seen, but never so placed"
+
+
 def test_how_likely_a_thing_is_of_several_classes_depends_on_no_ids(store: Store) -> None:
     map_id, _, _ = fill(store)
     first = stored_landmarks(store, map_id)[0]

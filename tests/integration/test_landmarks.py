@@ -12,6 +12,8 @@ import pytest
 from sqlalchemy import text
 
 from semdb.database.landmark_rows import LANDMARKS, give_up, load_gravity
+from semdb.database.moving import move
+from semdb.database.pose_records import Move, MovedRecording, OperationKind
 from semdb.database.records import KeyframeRecord, MapInfo, RecordingPlan
 from semdb.database.scene_reading import sighting_boxes
 from semdb.database.store import Store, open_store
@@ -153,6 +155,22 @@ def test_ids_live_on_when_keyframes_come_and_go(store: Store) -> None:
     assert all(sighting[:2] != ("visit", 0) for sightings in left.values() for sighting in sightings)
     refine(store, info)
     assert set(things(store)) <= set(after)
+
+
+def test_a_recording_that_was_moved_has_landmarks_in_its_new_map(tmp_path: Path) -> None:
+    """Its objects were sightings of landmarks of the map that it came from."""
+    with open_store(f"sqlite:///{tmp_path}/m.sqlite3", create=True) as store:
+        room, own = ingest(store, [0], "room"), ingest(store, [3, 4], "own")
+        refine(store, own)
+        poses = dict(zip(*store.poses(own.id), strict=True))
+        moved = MovedRecording(store.status(own.id)[0].recording_id, own.id, "second", np.eye(4))
+        move(store.engine, Move(OperationKind.ALIGN, room.id, poses, poses, (moved,)))
+        rows = refine(store, room)
+        assert {name for sightings in things(store).values() for name, *_ in sightings} == {"visit", "second"}
+        before = things(store)
+        assert refine(store, own) == 0
+        assert things(store) == before
+        assert table(store, "SELECT map_id, COUNT(*) FROM landmarks GROUP BY map_id") == [(room.id, rows)]
 
 
 def test_a_deleted_map_leaves_nothing(store: Store) -> None:

@@ -364,6 +364,12 @@ def test_upgrades_that_were_cut_off_go_on(engine: Engine) -> None:
         assert schema.current_revision(engine) == schema.HEAD
         with engine.connect() as connection:
             assert compare_metadata(MigrationContext.configure(connection), metadata) == []
+    with engine.begin() as connection:  # a downgrade that was cut off
+        connection.execute(text("DROP INDEX ix_landmark_relations_pair"
+                                f"{'' if engine.dialect.name == 'sqlite' else ' ON landmark_relations'}"))  # fmt: skip
+        connection.execute(text("ALTER TABLE landmark_relations DROP COLUMN map_id"))
+    schema.downgrade(engine, "0018")
+    assert not {"category_id", "map_id"} & {one["name"] for one in inspect(engine).get_columns("landmark_relations")}
 
 
 def test_a_database_of_before_gets_tokens(engine: Engine, empty_url: str) -> None:
