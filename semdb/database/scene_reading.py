@@ -10,10 +10,11 @@ from sqlalchemy import BigInteger, Connection, Engine, cast, func, select
 
 from semdb.database import checked, retry
 from semdb.database.exact_sums import exact_sum
+from semdb.database.ids import camera_row
 from semdb.database.landmark_tables import landmark_sightings, landmarks, map_gravity
 from semdb.database.refinements import MICRO, map_state_of, within
-from semdb.database.tables import categories, keyframes, loop_closures, objects, recordings, refinements
-from semdb.types import FloatArray, Int64Array
+from semdb.database.tables import cameras, categories, keyframes, loop_closures, objects, recordings, refinements
+from semdb.types import Camera, FloatArray, Int64Array
 
 MOST_PIXELS = 1e6
 _UP = ("up_x", "up_y", "up_z")
@@ -51,16 +52,21 @@ def sightings_in_keyframe(engine: Engine, keyframe_id: int) -> list[StoredSighti
     return _read(engine, _statement().where(objects.c.keyframe_id == int(keyframe_id)))
 
 
-def sighting_boxes(engine: Engine, map_id: int) -> tuple[Int64Array, Int64Array, FloatArray]:
+def sighting_boxes(engine: Engine, map_id: int, camera: Camera) -> tuple[Int64Array, Int64Array, FloatArray]:
     """Which landmark ``[n]`` of a map which keyframe ``[n]`` shows (ids), and in which boxes ``[n, 4]`` (pixels).
 
-    By landmark and object; a row whose box is damaged is left out.
+    Of the keyframes that `camera` took, by landmark and object; a row whose box is damaged is left out.
     """
     s, o, m = landmark_sightings.c, objects.c, landmarks.c
+    by_camera = keyframes.join(cameras, cameras.c.id == keyframes.c.camera_id)
     query = (
         select(s.landmark_id, o.keyframe_id, o.x1, o.y1, o.x2, o.y2)
-        .select_from(landmark_sightings.join(objects, o.id == s.object_id).join(landmarks, m.id == s.landmark_id))
-        .where(m.map_id == map_id)
+        .select_from(
+            landmark_sightings.join(objects, o.id == s.object_id)
+            .join(landmarks, m.id == s.landmark_id)
+            .join(by_camera, keyframes.c.id == o.keyframe_id)
+        )
+        .where(m.map_id == map_id, cameras.c.digest == camera_row(camera)["digest"])
         .order_by(s.landmark_id, s.object_id)
     )
     rows = retry.read(engine, lambda c: list(c.execute(query)))

@@ -33,7 +33,7 @@ MILLION = 1_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SightingBoxes:
-    """Boxes of what shows landmarks in keyframes, by which is known how far boxes are off."""
+    """Boxes of what shows landmarks in keyframes of one camera, by which is known how far boxes are off."""
 
     landmark: Int64Array  # [n] id
     keyframe: Int64Array  # [n] row of the keyframes' poses
@@ -54,7 +54,7 @@ def read_map_landmarks(
     for found in store.class_confusions(map_id):
         confusions.setdefault(found.category, {})[found.other] = found.weight
     known, _ = load_landmarks(store.engine, map_id, lambda _: None)
-    landmark, keyframe, boxes = sighting_boxes(store.engine, map_id)
+    landmark, keyframe, boxes = sighting_boxes(store.engine, map_id, cameras[0])
     ids = np.array(keyframe_ids, np.int64)
     row = np.minimum(np.searchsorted(ids, keyframe), max(len(ids) - 1, 0))
     there = ids[row] == keyframe if len(ids) else np.zeros(len(row), np.bool_)

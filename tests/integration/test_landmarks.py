@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -244,13 +245,15 @@ def test_damaged_rows_are_left_out_aloud(store: Store) -> None:
     shown = {sighting[1] for sightings in things(store).values() for sighting in sightings}
     assert shown == {0, 3}
     known = {head.id: head.frame_index for head in store.keyframe_heads(info.id)}
-    landmark, keyframe, boxes = sighting_boxes(store.engine, info.id)
+    (camera,) = store.cameras(info.id)
+    landmark, keyframe, boxes = sighting_boxes(store.engine, info.id, camera)
     rows = sum(len(sightings) for sightings in things(store).values())
     assert landmark.tolist() == sorted(landmark.tolist())
     assert {known[one] for one in keyframe.tolist()} == shown
     assert boxes.shape == (rows, 4)
     with store.engine.begin() as connection:
         connection.execute(text("UPDATE objects SET x1 = 1e9 WHERE keyframe_id = :key"), {"key": heads[3]})
-    left = sighting_boxes(store.engine, info.id)
+    left = sighting_boxes(store.engine, info.id, camera)
     assert {known[one] for one in left[1].tolist()} == {0}
     assert (boxes[:, 2:] >= boxes[:, :2]).all()
+    assert len(sighting_boxes(store.engine, info.id, replace(camera, fx=camera.fx + 1))[0]) == 0  # took none
