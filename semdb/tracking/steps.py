@@ -15,7 +15,7 @@ from semdb.localization.pairs import Pairs, guided_pairs, reprojection_px, world
 from semdb.localization.pose import robust_pnp
 from semdb.localization.views import KeyframeView, View
 from semdb.tracking.options import PlacingOptions
-from semdb.tracking.placing import fitted_pose, project_all
+from semdb.tracking.placing import Placed, fitted_pose, project_all
 from semdb.tracking.pose_filter import Step
 from semdb.types import BoolArray, FloatArray, IntArray
 
@@ -45,10 +45,37 @@ class SeenStep:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameBefore:
-    """The last frame as a keyframe in its own camera; `turn` ``[3]`` (rad) is how it turned while it was read out."""
+    """The last frame as a keyframe in its own camera; `turn` ``[3]`` (rad) is how it turned while it was read out.
+
+    None where that is not known: nothing near has placed it.
+    """
 
     keyframe: KeyframeView
     turn: FloatArray | None
+
+
+def frame_before(view: View, placed: Placed | None) -> FrameBefore | None:
+    """A frame as a keyframe in its own camera: with measured depth, and where that is none with that of the map."""
+    depth = view.points[:, 2].astype(np.float64)
+    if placed is not None:
+        pairs, camera_from_world = placed.estimate.pairs, invert_pose(placed.pose)
+        for slot, keyframe in enumerate(placed.keyframes):
+            here = np.flatnonzero(pairs.slot == slot)
+            rows = pairs.query[here]
+            z = transform_points(camera_from_world, keyframe.world_points[pairs.keypoint[here]])[:, 2]
+            depth[rows] = np.where(np.isfinite(depth[rows]), depth[rows], z)
+    kept = np.flatnonzero(np.isfinite(depth) & (depth > 0)).astype(np.int32)
+    if not len(kept):
+        return None
+    points = np.column_stack([view.xy[kept] * depth[kept, None], depth[kept]])
+    own = replace(
+        view, seen_xy=view.seen_xy[kept], xy=view.xy[kept], size=view.size[kept],
+        descriptors=view.descriptors[kept], classes=view.classes[kept], signs=view.signs[kept],
+        points=points.astype(np.float32), source=view.source[kept],
+        looser=None if view.looser is None else view.looser[kept],
+    )  # fmt: skip
+    known = KeyframeView(-1, own, np.eye(4), np.eye(4), points)
+    return FrameBefore(known, None if placed is None else placed.estimate.turn)
 
 
 def refined_step(before: FrameBefore, view: View, seen: SeenStep, turn: FloatArray) -> Step | None:

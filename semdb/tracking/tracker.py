@@ -24,7 +24,7 @@ from semdb.tracking.placing import (
 from semdb.tracking.pose_filter import FilterState, Step, begin, faded, measured, moved, surprise, transition_of
 from semdb.tracking.smoothing import Passage
 from semdb.tracking.states import TrackedPose, TrackSource, TrackState
-from semdb.tracking.steps import FrameBefore, SeenStep, is_steady, refined_step, step_between
+from semdb.tracking.steps import FrameBefore, SeenStep, frame_before, is_steady, refined_step, step_between
 from semdb.types import FloatArray, Localization, Verdict
 
 USUAL_DISTANCE_M = 2.0  # of what is seen, where nothing is known of it
@@ -74,6 +74,7 @@ class Tracker:
         self._waiting: list[_Fix] = []
         self._map_from_odom: FloatArray | None = None
         self._begun = False  # the last relocalization began anew
+        self._expected: FilterState | None = None  # where the motion put the last frame, before it was placed
         self.passage = Passage(None, None, None)  # of the last frame, for a smoother
         self._recorded: FloatArray | None = None  # [6, 6] how far recorded poses are off their images hereabouts
         self._since_bent = -1  # frames since that was looked at
@@ -92,26 +93,34 @@ class Tracker:
         if not gap_s > SHORTEST_S:
             raise ValueError(f"frames come in the order of their times: {time_s} s is not after {self._time_s} s")
         step, source, seen = self._motion(view, gap_s, odom_from_camera)
-        before, predicted, transition = self._state, None, None
-        if before is not None and step is not None:
-            self._state = moved(before, step, self.options.motion)
+        before, found = self._state, None
+        self._expect(before, step)
         placed = self._by_keyframes(view)
-        if placed is not None and seen is not None:
-            step = self._exactly(view, seen, placed) or step
-        if before is not None and step is not None:
-            transition = transition_of(before, step, self.options.motion)
-            predicted = self._state = moved(before, step, self.options.motion)
+        if placed is not None:
+            exact = None if seen is None else self._exactly(view, seen, placed)
+            if exact is not None:
+                self._expect(before, exact)
+            found = self._accept(view, placed, time_s)
+            if found is not None:
+                step = exact or step
+            elif exact is not None:  # it is solved with how the image turned in a pose that does not hold
+                self._expect(before, step)
         self._waiting = [
             replace(fix, state=moved(fix.state, step, self.options.motion)) for fix in self._waiting if step is not None
         ]
-        found = None if placed is None else self._accept(view, placed, time_s)
         if found is None:
             found = self._relocalized(view, time_s, relocalize) or self._carried_on(time_s, source)
         begun = found.source is TrackSource.RELOCALISED and self._begun
-        self.passage = Passage(None if begun else predicted, transition, self._state)
+        transition = None if before is None or step is None else transition_of(before, step, self.options.motion)
+        self.passage = Passage(None if begun else self._expected, transition, self._state)
         self._remember(view, placed, found, step, source, gap_s, time_s, odom_from_camera)
         found = self._with_odometry(found, odom_from_camera)
         return replace(found, latency_ms=(time.perf_counter() - started) * 1000)
+
+    def _expect(self, before: FilterState | None, step: Step | None) -> None:
+        """The state that a step from `before` leads to."""
+        self._expected = None if before is None or step is None else moved(before, step, self.options.motion)
+        self._state = self._expected or before
 
     def _motion(
         self, view: View, gap_s: float, odom_from_camera: FloatArray | None
@@ -146,13 +155,12 @@ class Tracker:
     def _exactly(self, view: View, seen: SeenStep, placed: Placed) -> Step | None:
         """A step between two images again, now that it is known how they turned while they were read out.
 
-        None where that says nothing that is not known better by the map.
+        None where that is not known of one of them, or says nothing that is not known better by the map.
         """
         motion = self.options.motion
-        if self._before is None or placed.estimate.turn is None:
+        if self._before is None or self._before.turn is None or placed.estimate.turn is None:
             return None
-        turns = [self._before.turn, placed.estimate.turn]
-        turned = sum(float(np.linalg.norm(turn)) for turn in turns if turn is not None)
+        turned = float(np.linalg.norm(self._before.turn) + np.linalg.norm(placed.estimate.turn))
         bent = self._bending()
         if bent[0, 0] + self._unrest * (motion.exact_m_per_rad * turned) ** 2 > motion.bent_m**2:
             return None
@@ -195,7 +203,7 @@ class Tracker:
                 or not convinces(view, placed, self.options.placing)
             ):
                 return None
-            state = faded(state, off)
+            state = self._expected = faded(state, off)
         self._learn(off)
         self._state = measured(state, placed.pose, covariance, self.options.motion)
         self._seen_s, self._waiting = time_s, []
@@ -306,9 +314,7 @@ class Tracker:
             self._velocity = np.concatenate([motion[:3, 3], so3_log(motion[:3, :3])]) / gap_s
         seen = found.state is TrackState.TRACKING or moved_by is TrackSource.ODOMETRY
         self._unseen_s = 0.0 if seen else self._unseen_s + gap_s
-        placed = placed if found.source is TrackSource.TRACKED else None
-        own = _with_points(view, placed)
-        self._before = None if own is None else FrameBefore(own, None if placed is None else placed.estimate.turn)
+        self._before = frame_before(view, placed if found.source is TrackSource.TRACKED else None)
 
     def _with_odometry(self, found: TrackedPose, odom_from_camera: FloatArray | None) -> TrackedPose:
         """The same with what corrects the odometry; it stays as it was while nothing is measured."""
@@ -374,26 +380,3 @@ def _distance_of(keyframe: KeyframeView, pose: FloatArray) -> float:
     z = transform_points(invert_pose(pose), keyframe.world_points)[:, 2]
     z = z[z > 0.1]
     return float(np.quantile(z, 0.25)) if len(z) else USUAL_DISTANCE_M
-
-
-def _with_points(view: View, placed: Placed | None) -> KeyframeView | None:
-    """A frame as a keyframe in its own camera: with measured depth, and where that is none with that of the map."""
-    depth = view.points[:, 2].astype(np.float64)
-    if placed is not None:
-        pairs, camera_from_world = placed.estimate.pairs, invert_pose(placed.pose)
-        for slot, keyframe in enumerate(placed.keyframes):
-            here = np.flatnonzero(pairs.slot == slot)
-            rows = pairs.query[here]
-            z = transform_points(camera_from_world, keyframe.world_points[pairs.keypoint[here]])[:, 2]
-            depth[rows] = np.where(np.isfinite(depth[rows]), depth[rows], z)
-    kept = np.flatnonzero(np.isfinite(depth) & (depth > 0)).astype(np.int32)
-    if not len(kept):
-        return None
-    points = np.column_stack([view.xy[kept] * depth[kept, None], depth[kept]])
-    own = replace(
-        view, seen_xy=view.seen_xy[kept], xy=view.xy[kept], size=view.size[kept],
-        descriptors=view.descriptors[kept], classes=view.classes[kept], signs=view.signs[kept],
-        points=points.astype(np.float32), source=view.source[kept],
-        looser=None if view.looser is None else view.looser[kept],
-    )  # fmt: skip
-    return KeyframeView(-1, own, np.eye(4), np.eye(4), points)

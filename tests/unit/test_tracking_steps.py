@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 
 from semdb.geometry import pose_error, pose_from, so3_exp, transform_points
+from semdb.localization.views import View
 from semdb.tracking.options import MotionOptions
-from semdb.tracking.pose_filter import Step, begin, faded, measured
+from semdb.tracking.pose_filter import Step, begin, faded, measured, transition_of
+from semdb.tracking.smoothing import Passage, smoothed
+from semdb.tracking.states import TrackSource, TrackState
 from semdb.tracking.step_kernels import largest_difference, solve_step
-from semdb.tracking.tracker import exact_noise
+from semdb.tracking.steps import FrameBefore
+from semdb.tracking.tracker import Tracker, exact_noise
+from semdb.types import Camera
 
 LOOSE, TIGHT = np.full(3, 1 / 0.002**2), np.full(3, 1e12)
 
@@ -79,3 +86,57 @@ def test_a_state_that_is_contradicted_follows_what_is_measured() -> None:
     state, there = begin(np.eye(4), sure, options), pose_from(np.eye(3), [0.05, 0, 0])
     assert measured(state, there, sure, options).pose[0, 3] < 0.04
     assert measured(faded(state, 100.0), there, sure, options).pose[0, 3] > 0.045
+
+
+def no_keypoints() -> View:
+    nothing = np.zeros(0, np.float32)
+    return View(
+        camera=Camera(640, 480, 525.0, 525.0, 320.0, 240.0), seen_xy=nothing.reshape(0, 2),
+        xy=np.zeros((0, 2)), size=nothing, descriptors=nothing.reshape(0, 64), classes=np.zeros(0, np.int32),
+        signs=np.zeros(0, np.int8), points=nothing.reshape(0, 3), source=np.zeros(0, np.int32),
+    )  # fmt: skip
+
+
+def tracker_at(pose: np.ndarray, sigma: float) -> Tracker:
+    found = Tracker(Mock())
+    found._state = begin(pose, np.eye(6) * sigma**2, found.options.motion)
+    return found
+
+
+def placed_at(pose: np.ndarray, sigma: float, turn: np.ndarray | None = None) -> Mock:
+    estimate = Mock(turn=turn, inliers=100, recorded=None)
+    return Mock(pose=pose, covariance=np.eye(6) * sigma**2, estimate=estimate, keyframes=())
+
+
+def test_what_a_contradicted_state_forgot_is_not_smoothed_into_the_frames_before(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("semdb.tracking.tracker.convinces", lambda *_: True)
+    tracker = tracker_at(np.eye(4), 0.001)
+    before, still = tracker._state, Step(np.eye(4), np.eye(6) * 1e-8)
+    tracker._expect(before, still)
+    assert before is not None
+    assert tracker._accept(no_keypoints(), placed_at(pose_from(np.eye(3), [0.05, 0, 0]), 0.001), 1.0)
+    passage = Passage(tracker._expected, transition_of(before, still, tracker.options.motion), tracker._state)
+    pose, _ = smoothed([Passage(None, None, before), passage])
+    assert pose is not None
+    assert np.abs(pose[:3, 3]).max() < 0.005
+
+
+def test_a_step_solved_with_a_pose_that_does_not_hold_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    tracker = tracker_at(np.eye(4), 0.001)
+    tracker._time_s = tracker._seen_s = 0.0
+    rough, wrong = (Step(pose_from(np.eye(3), [x, 0, 0]), np.eye(6) * 1e-6) for x in (0.02, 0.08))
+    monkeypatch.setattr(tracker, "_motion", lambda *_: (rough, TrackSource.ODOMETRY, Mock()))
+    monkeypatch.setattr(tracker, "_exactly", lambda *_: wrong)
+    monkeypatch.setattr(tracker, "_by_keyframes", lambda _: placed_at(pose_from(np.eye(3), [5.0, 0, 0]), 0.001))
+    found = tracker.update(no_keypoints(), 0.1, Mock())
+    assert found.state is TrackState.COASTING
+    assert found.world_from_camera is not None
+    assert found.world_from_camera[0, 3] == pytest.approx(0.02)
+
+
+def test_a_step_from_an_image_whose_turn_is_not_known_is_not_solved_exactly() -> None:
+    tracker = tracker_at(np.eye(4), 0.001)
+    tracker._before = FrameBefore(Mock(), None)
+    assert tracker._exactly(no_keypoints(), Mock(), placed_at(np.eye(4), 0.001, np.zeros(3))) is None
