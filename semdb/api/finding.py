@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 MOST_HITS = 1000
 RATHER = 0.5  # of a relation
+LEAST = 0.3  # of one: what counts less is one to what only may be of a class
 NEVER_SEEN, GONE, NOT_LOOKED_AT = "never_seen", "gone", "not_looked_at"
 
 
@@ -190,10 +191,12 @@ def _viewpoint(row: Any) -> Viewpoint | None:
     )
 
 
-def _is_sure(hits: Sequence[FoundLandmark], wanted: Wanted) -> bool:
-    """Whether one of the hits is rather of a class that was asked for than of another, and rather stands so."""
+def _is_sure(hits: Sequence[FoundLandmark], wanted: Wanted, least: float = RATHER) -> bool:
+    """Whether one of the hits is rather of a class that was asked for than of another, and stands so: `least` says how
+    surely.
+    """
     parts = [name for name in ("near", "on") if getattr(wanted, name)]
-    return any(hit.category in wanted.classes and all(hit.parts[name] >= RATHER for name in parts) for hit in hits)
+    return any(hit.category in wanted.classes and all(hit.parts[name] >= least for name in parts) for hit in hits)
 
 
 def _missing(
@@ -216,7 +219,7 @@ def _missing(
         return Missing(GONE, text, _candidates(gone), usual)
     if not there:
         return Missing(NEVER_SEEN, f"{said}: never seen{_called(known.loose, known.others)}{but}", (), usual)
-    if any(hit.category in wanted.classes for hit in hits) or _is_cut_off(store, wanted, hits):
+    if _is_sure(hits, wanted, LEAST) or _is_cut_off(store, wanted, hits):
         return None  # it stands so, if not surely
     if wanted.seen_after_ns is not None or wanted.seen_in is not None:
         text = f"{said}: seen, but not since then; where it was has not been seen empty{but}"

@@ -149,10 +149,10 @@ def test_a_miss_is_told_beside_what_is_rather_something_else(store: Store) -> No
     assert (len(hits), text_of) == (6, f"vase: was seen, and later keyframes see through its place{but}")
 
 
-def test_what_comes_after_the_last_hit_is_not_said_to_miss(tmp_path: Path) -> None:
+def test_what_is_said_of_hits_that_are_cut_off_or_beside_something_else(tmp_path: Path) -> None:
     with open_store(f"sqlite:///{tmp_path}/m.sqlite3", create=True) as store:
         map_id, _, _ = fill(store)
-        _, cup, *_, other_cup, banana, _ = stored_landmarks(store, map_id)
+        _, cup, chair, _, other_cup, banana, book = stored_landmarks(store, map_id)
         with store.engine.begin() as connection:
             query = "UPDATE landmark_categories SET probability = 0.9, category_id = (SELECT id FROM categories "
             connection.execute(text(f"{query} WHERE name = 'cup') WHERE landmark_id = {banana}"))
@@ -164,6 +164,13 @@ def test_what_comes_after_the_last_hit_is_not_said_to_miss(tmp_path: Path) -> No
         placed = find(store, "cup", map="room", near="book", limit=1).missing
         assert placed is not None
         assert placed.text == "cup: seen, but never so placed"
+        with store.engine.begin() as connection:  # there is a vase, and the chair is near a table that may be one
+            vase = "(SELECT id FROM categories WHERE name = 'vase')"
+            connection.execute(text(f"UPDATE landmarks SET category_id = {vase} WHERE id = {book}"))
+        beside = find(store, "chair", map="room", near="vase")
+        assert [hit.landmark_id for hit in beside.hits] == [chair]
+        assert beside.missing is not None
+        assert beside.missing.text.startswith("chair: seen, but never so placed; what was found is rather something")
 
 
 def test_how_likely_a_thing_is_of_several_classes_depends_on_no_ids(store: Store) -> None:
