@@ -170,9 +170,7 @@ def replace_landmarks(connection: Connection, map_id: int, found: LandmarkSet, k
             ids.append(key)
             told.append({**values, "id": key})
     update_rows(connection, landmarks, select(landmarks).where(c.map_id == map_id), told)
-    taken = {s.object_id for row in found.landmarks for s in row.sightings} - old.keys()
-    # of a recording that was moved here, sightings of landmarks of the map that it came from
-    delete_keys(connection, landmark_sightings, landmark_sightings.c.object_id, sorted(taken))
+    _take_sightings(connection, sorted({s.object_id for row in found.landmarks for s in row.sightings} - old.keys()))
     for table, group, rows in _rows_beside(connection, map_id, found, ids, known):
         stored = select(table).join(landmarks, c.id == table.c.landmark_id).where(c.map_id == map_id)
         write_groups(connection, table, group, stored, rows)
@@ -245,6 +243,18 @@ def _landmark_of_objects(connection: Connection, map_id: int) -> dict[int, int]:
     s, m = landmark_sightings.c, landmarks.c
     query = select(s.object_id, s.landmark_id).join(landmarks, m.id == s.landmark_id).where(m.map_id == map_id)
     return {int(row.object_id): int(row.landmark_id) for row in connection.execute(query)}
+
+
+def _take_sightings(connection: Connection, object_ids: Sequence[int]) -> None:
+    """Of a recording that was moved here objects are sightings of landmarks of the map that it came from: not any more.
+
+    They are looked for first, since servers lock what is not there when it is deleted, and others wait.
+    """
+    c, there = landmark_sightings.c, []
+    for start in range(0, len(object_ids), CHUNK):
+        query = select(c.object_id).where(c.object_id.in_(object_ids[start : start + CHUNK]))
+        there += list(connection.execute(query).scalars())
+    delete_keys(connection, landmark_sightings, c.object_id, there)
 
 
 def _category_ids(connection: Connection, names: Sequence[str]) -> dict[str, int]:
