@@ -36,6 +36,7 @@ from bench.landmarks.scores import HEADER, Score, score, summed
 from semdb.cli.options import load_settings
 from semdb.evaluation.runner import EvaluateOptions, evaluate
 from semdb.landmarks.build import find_landmarks
+from semdb.landmarks.sizes import sizes_of
 from semdb.recordings.synthetic import SyntheticOptions, write_synthetic_recording
 
 SHAPES = {MASK: "", BY_DEPTH: "boxes:", BOX: "whole-boxes:"}
@@ -77,7 +78,7 @@ def in_rooms(count: int, keyframes: int) -> dict[str, dict[str, float]]:
         numbers, things = class_numbers([room]), true_things(room)
         for shape in SHAPES:
             seen, labels = seen_keyframes(room, numbers, Mistakes(depth_noise=True, shape=shape))
-            found = find_landmarks(seen, len(numbers))
+            found = find_landmarks(seen, len(numbers), sizes=sizes_of(list(numbers)))
             scores[shape].append(score(found.landmarks, labels, things, list(numbers)))
             objects[shape] += of_objects(room, shape)
     figures = {}

@@ -24,6 +24,7 @@ from semdb.ingestion.view_overlap import ViewStack, view_grid
 from semdb.landmarks.build import SeenKeyframe, find_landmarks
 from semdb.landmarks.completion import completed
 from semdb.landmarks.lift import SeenObject, lift_keyframe
+from semdb.landmarks.sizes import sizes_of
 from semdb.perception.describe import Describer, describer_from_specs
 from semdb.perception.detectors.recorded import RecordedDetector
 from semdb.perception.encoders.gist import GistEncoder
@@ -106,7 +107,8 @@ def compare(place: str, frames: Sequence[Seen], count: int) -> Row:
         lifted = lift_keyframe(frame.camera, frame.pose, frame.depth, things)
         category = np.array([thing.category for thing in things], np.int64)
         seen.append(SeenKeyframe(lifted, category, np.array([thing.score for thing in things], np.float64), 0))
-    more = completed([frame.objects for frame in keyframes], find_landmarks(seen, len(names)).landmarks, names)
+    found = find_landmarks(seen, len(names), sizes=sizes_of(names)).landmarks
+    more = completed([frame.objects for frame in keyframes], found, names)
     before = [strengths(frame.found.evidence) for frame in keyframes]
     after = [with_more(own, added) for own, added in zip(before, more, strict=True)]
     frequency: dict[str, int] = {}

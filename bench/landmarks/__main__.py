@@ -27,7 +27,7 @@ from bench.landmarks.rooms import (
 )
 from bench.landmarks.scores import HEADER, Score, relation_counts, score, summed
 from semdb.landmarks.build import find_landmarks
-from semdb.landmarks.longest import longest_of
+from semdb.landmarks.sizes import sizes_of
 
 SETTINGS = {"exact": EXACT, "mistakes": SPOILED, "exact, noisy depth": NOISY, "mistakes, noisy depth": SPOILED_NOISY}
 
@@ -45,7 +45,7 @@ def main() -> None:
         for name, mistakes in SETTINGS.items():
             keyframes, labels = seen_keyframes(room, numbers, mistakes)
             start = time.perf_counter()
-            found = find_landmarks(keyframes, len(numbers), longest=longest_of(list(numbers)))
+            found = find_landmarks(keyframes, len(numbers), sizes=sizes_of(list(numbers)))
             seconds += time.perf_counter() - start
             scores[name].append(score(found.landmarks, labels, things, list(numbers)))
             for kind, counts in relation_counts(found.landmarks, labels, things, list(numbers)).items():

@@ -24,7 +24,7 @@ from bench.landmarks.rooms import Mistakes, RenderedRoom, class_numbers, render_
 from bench.landmarks.scores import SEEN, main_label
 from semdb.landmarks.build import SeenKeyframe, find_landmarks
 from semdb.landmarks.changes import Change, SeenIn, VisitedThing, find_changes
-from semdb.landmarks.longest import longest_of
+from semdb.landmarks.sizes import sizes_of
 from semdb.landmarks.values import Landmark
 from semdb.landmarks.visits import Presence, Visit
 from semdb.types import FloatArray
@@ -96,7 +96,7 @@ def measure(two: TwoVisits, mistakes: Mistakes) -> Told:
         keyframes += mine
         labels += true
         counts.append(Counter(label for frame in true for label in set(frame)))
-    found = find_landmarks(keyframes, len(numbers), longest=longest_of(list(numbers))).landmarks
+    found = find_landmarks(keyframes, len(numbers), sizes=sizes_of(list(numbers))).landmarks
     main = [main_label(thing, labels) for thing in found]
     changes = find_changes([visited(k, thing, list(numbers)) for k, thing in enumerate(found)])
     wrong, right = 0, set()

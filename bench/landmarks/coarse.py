@@ -39,7 +39,7 @@ from semdb.database.landmark_reading import StoredLandmark
 from semdb.geometry import invert_pose, pose_error
 from semdb.landmarks.boxes import upright_axes
 from semdb.landmarks.build import find_landmarks
-from semdb.landmarks.longest import longest_of
+from semdb.landmarks.sizes import sizes_of
 from semdb.landmarks.values import Landmarks
 from semdb.localization.landmark_kernels import LEAST_INSIDE, predict
 from semdb.localization.landmark_pose import (
@@ -144,7 +144,7 @@ def room_landmarks(room: RenderedRoom) -> MapLandmarks:
     numbers, mistakes = class_numbers([room]), SPOILED_NOISY
     names = list(numbers)
     keyframes, _ = seen_keyframes(room, numbers, mistakes)
-    found = find_landmarks(keyframes, len(numbers), longest=longest_of(list(numbers)))
+    found = find_landmarks(keyframes, len(numbers), sizes=sizes_of(list(numbers)))
     poses = np.stack([frame.pose for frame in room.frames])
     shares = np.rint(confusion_of(keyframes, len(numbers)) * MILLION).astype(np.int64)
     mixed = {names[k]: {names[o]: int(row[o]) for o in np.flatnonzero(row)} for k, row in enumerate(shares)}

@@ -41,8 +41,8 @@ from semdb.database.store import Store, open_store
 from semdb.landmarks.boxes import upright_axes
 from semdb.landmarks.build import SeenKeyframe, find_landmarks
 from semdb.landmarks.evidence import perhaps
-from semdb.landmarks.longest import longest_of
 from semdb.landmarks.relations import find_relations
+from semdb.landmarks.sizes import sizes_of
 from semdb.landmarks.values import Landmark, Landmarks
 from semdb.types import FloatArray
 
@@ -202,7 +202,7 @@ def ask(store: Store, room: RenderedRoom, setting: str) -> Iterator[Asked]:
     numbers, things = class_numbers([room]), true_things(room)
     keyframes, labels = seen_keyframes(room, numbers, SETTINGS[setting])
     found = find_landmarks(
-        keyframes, len(numbers), confusion_of(keyframes, len(numbers)), longest=longest_of(list(numbers))
+        keyframes, len(numbers), confusion_of(keyframes, len(numbers)), sizes=sizes_of(list(numbers))
     )
     counts: dict[int, int] = {}
     for frame in labels:

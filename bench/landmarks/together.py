@@ -22,7 +22,7 @@ from bench.landmarks.rooms import (
 )
 from bench.landmarks.scores import HEADER, score
 from semdb.landmarks.build import SeenKeyframe, find_landmarks
-from semdb.landmarks.longest import longest_of
+from semdb.landmarks.sizes import sizes_of
 from semdb.landmarks.values import Landmarks
 from semdb.recordings.synthetic.room import build_room
 
@@ -82,7 +82,7 @@ def main() -> None:
     print(f"{'':24}{HEADER}{'across':>8}{'seconds':>9}")
     for name, keyframes in building.keyframes.items():
         start = time.process_time()
-        found = find_landmarks(keyframes, len(building.numbers), longest=longest_of(list(building.numbers)))
+        found = find_landmarks(keyframes, len(building.numbers), sizes=sizes_of(list(building.numbers)))
         seconds = time.process_time() - start
         line = score(found.landmarks, building.labels[name], building.things, list(building.numbers)).line
         print(f"{name:24}{line}{across(found, building.labels[name]):8d}{seconds:9.0f}", flush=True)

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from semdb.landmarks.appearance import mean_colours
 from semdb.landmarks.boxes import shared_volume
-from semdb.landmarks.evidence import fuse, support
+from semdb.landmarks.evidence import fuse
 from semdb.landmarks.expected import expected_views
 from semdb.landmarks.gravity import Gravity
 from semdb.landmarks.lift import LiftedKeyframe
@@ -54,15 +54,14 @@ class Assembly:
         sightings: Sightings,
         views: Views,
         cluster: Int64Array,
-        classes: tuple[FloatArray, FloatArray],  # what they are called, and how long they are at most
+        names: FloatArray,
         gravity: Gravity,
         options: LandmarkOptions,
         memo: Memo,
     ) -> None:
         self._memo = memo
         self._keyframes, self._lifted, self._sightings = keyframes, lifted, sightings
-        (self._names, self._longest), self._gravity, self._options = classes, gravity, options
-        self._called: dict[int, int] = {}  # the class of each thing by its names alone, whatever its size
+        self._names, self._gravity, self._options = names, gravity, options
         order = np.argsort(cluster, kind="stable")
         roots, start = np.unique(cluster[order], return_index=True)
         ends = [*start[1:].tolist(), len(order)][: len(roots)]
@@ -121,8 +120,7 @@ class Assembly:
             known = {member.keyframe for member in one.members}
             if any(member.keyframe in known for member in other.members):
                 continue
-            called = self._called[roots[min(a, b)]], self._called[roots[max(a, b)]]
-            if called[0] != called[1] and mixed[called] <= 2 * float(self._names.min()):
+            if one.category != other.category and mixed[one.category, other.category] <= 2 * float(self._names.min()):
                 continue
             share = shared_volume(one.box, other.box) / float(min(np.prod(one.box.size), np.prod(other.box.size)))
             if share >= self._options.one_place:
@@ -137,6 +135,8 @@ class Assembly:
         objects.sort()
         category = np.array([self._keyframes[k].category[o] for k, o in objects], np.int64)
         score = np.array([self._keyframes[k].score[o] for k, o in objects], np.float64)
+        evidence = fuse(category, score, self._names)
+        best = int(np.argmax(np.round(evidence, 9)))
         around = self._around(rows, members)
         name = self._name(around, members, rows, score)
         found = None if name is None else self._memo.get(THING, name)
@@ -148,27 +148,9 @@ class Assembly:
         else:
             for one in found["asked"].tolist():
                 self._memo.keep(*one.decode().split(" "))
-        thing = thing_from(found, around, objects)
-        barred = float(thing.box.size.max()) > self._longest
-        called, evidence = fuse(category, score, self._names), fuse(category, score, self._names, barred)
-        best, self._called[root] = int(np.argmax(np.round(evidence, 9))), int(np.argmax(np.round(called, 9)))
-        said = support(np.array([k for k, _ in objects], np.int64), category, score)
-        # what mostly goes by a name for which it is too large is of no known class
-        sure = not barred[best] and said.get(best, 0.0) >= max(
-            said.get(self._called[root], 0.0), self._options.sure_score * self._least(thing.keyframes, thing.missed)
-        )
-        unsure = thing.state is LandmarkState.CONFIRMED and not sure
         return replace(
-            thing,
-            category=best,
-            probability=float(evidence[best]),
-            evidence=evidence,
-            state=LandmarkState.TENTATIVE if unsure else thing.state,
+            thing_from(found, around, objects), category=best, probability=float(evidence[best]), evidence=evidence
         )
-
-    def _least(self, keyframes: int, missed: int) -> float:
-        """How many keyframes have to show a thing that so many show and missed."""
-        return max(self._options.confirmed, self._options.confirmed_share * (keyframes + missed))
 
     def _around(self, rows: Int64Array, members: Mapping[int, Sequence[int]]) -> Around:
         """The keyframes that have to do with a thing: those that show it, and those that may have it in view."""
@@ -299,7 +281,7 @@ class Assembly:
         later = [k for k in through if self._is_later(k, last)]
         if len(later) >= options.gone:
             return LandmarkState.GONE
-        if keyframes >= self._least(keyframes, missed):
+        if keyframes >= options.least(keyframes, missed):
             return LandmarkState.CONFIRMED
         return LandmarkState.TENTATIVE
 

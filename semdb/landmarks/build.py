@@ -19,6 +19,8 @@ from semdb.landmarks.links import find_links, sighting_table, weights
 from semdb.landmarks.memo import Forgetful, Memo
 from semdb.landmarks.options import LandmarkOptions
 from semdb.landmarks.places import agreed
+from semdb.landmarks.settling import settle
+from semdb.landmarks.sizes import Sizes, unknown_sizes
 from semdb.landmarks.values import Landmarks
 from semdb.landmarks.visibility import Sightings, Views, collect, look
 from semdb.types import FloatArray, Int64Array
@@ -37,13 +39,13 @@ def find_landmarks(
     options: LandmarkOptions | None = None,
     progress: Progress | None = None,
     memo: Memo | None = None,
-    longest: FloatArray | None = None,
+    sizes: Sizes | None = None,
 ) -> Landmarks:
     """The landmarks of a map, of its keyframes by recording's name and frame.
 
     `confusion` ``[classes, classes]``: shares of what goes by another name (see `evidence.name_probabilities`). `up`
     ``[3]``: which way is up, where that is known. `memo`: what was found before, of keyframes that have names.
-    `longest` ``[classes]``, metres: a thing with a longer side is of another class (see `longest`).
+    `sizes`: what is known of those of classes (`sizes_of`).
     """
     options, memo = options or LandmarkOptions(), memo or Forgetful()
     lifted = [frame.lifted for frame in keyframes]
@@ -57,13 +59,18 @@ def find_landmarks(
     views = look(lifted, sightings, options.see, progress, memo)
     names = name_probabilities(classes, confusion)
     cluster = associate(keyframes, lifted, sightings, views, names, options)
-    bounds = np.full(classes, np.inf) if longest is None else longest
-    found = Assembly(keyframes, lifted, sightings, views, cluster, (names, bounds), gravity, options, memo)
-    landmarks = found.all()
+    found = Assembly(keyframes, lifted, sightings, views, cluster, names, gravity, options, memo)
+    landmarks = settle(
+        sorted(found.all(), key=lambda thing: thing.key),
+        keyframes,
+        confusion,
+        unknown_sizes(classes) if sizes is None else sizes,
+        options,
+    )
     objects = sum(len(frame.category) for frame in keyframes)
     placed = sum(len(thing.members) for thing in landmarks)
     return Landmarks(
-        tuple(sorted(landmarks, key=lambda thing: thing.key)),
+        tuple(landmarks),
         gravity,
         float(np.median(moved)) if moved else 0.0,
         objects - placed,

@@ -1,8 +1,13 @@
-"""What class a thing is: every sighting is evidence, as strong as the detector is sure and is known to be right."""
+"""What class a thing is: every sighting is evidence, as strong as the detector is sure and is known to be right.
+
+What all things of a map were called says more than the names of one: how often names stand for one thing, and how many
+things of each class there are (`settled`, by expectation and maximization as Dawid and Skene do with the votes of
+observers, 1979; but what a thing of a class is called stays as it was measured).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -11,6 +16,11 @@ from semdb.types import BoolArray, FloatArray, Int64Array
 FLOOR = 0.02  # of the probability of any name, whatever the thing is
 LEAST_LIKELY = 0.002  # of a class that a thing may be
 SURE = 0.9  # share of right names of a class whose confusions nobody knows
+SEVERAL = 8.0  # names that are added to those of a class, so that a few do not make a large share
+FEW = 2.0  # things that are added to those of each class
+ROUNDS = 10
+WHOLE = 1e9  # scores and probabilities are summed as whole multiples of its inverse: in any order
+Named = tuple[Int64Array, FloatArray]  # names [k] and scores [k] that a thing was seen under
 
 
 def name_probabilities(classes: int, confusion: FloatArray | None = None) -> FloatArray:
@@ -31,21 +41,82 @@ def name_probabilities(classes: int, confusion: FloatArray | None = None) -> Flo
     return np.asarray(found / found.sum(axis=1, keepdims=True), np.float64)
 
 
-def fuse(category: Int64Array, score: FloatArray, names: FloatArray, barred: BoolArray | None = None) -> FloatArray:
-    """Probabilities ``[classes]`` of what a thing is, of the names ``[k]`` and scores ``[k]`` that it was seen under.
-
-    A name of score s says with weight s that it was given by `name_probabilities`, and nothing with weight 1 - s.
-    Classes that are `barred` ``[classes]`` it cannot be, unless it has no other name. Numbers are rounded, so that the
-    same evidence in another order is the same to the last bit.
-    """
-    classes = names.shape[1]
-    certain = np.clip(score, 0.05, 0.99)[:, None]
-    likelihood = np.log(certain * names[:, category].T + (1 - certain) / max(classes, 1))
-    total = np.rint(likelihood * 1e9).astype(np.int64).sum(axis=0) / 1e9
-    if barred is not None and not barred[category].all():
-        total = np.where(barred, -np.inf, total)
+def fuse(category: Int64Array, score: FloatArray, names: FloatArray) -> FloatArray:
+    """Probabilities ``[classes]`` of what a thing is, of the names ``[k]`` and scores ``[k]`` it was seen under."""
+    total = of_names(category, score, names)
     found = np.exp(total - total.max())
     return np.asarray(found / found.sum(), np.float64)
+
+
+def of_names(category: Int64Array, score: FloatArray, names: FloatArray) -> FloatArray:
+    """Logarithms ``[classes]`` of how likely a thing of each class is seen under names ``[k]`` and scores ``[k]``.
+
+    A name of score s says with weight s that it was given by `name_probabilities`, and nothing with weight 1 - s.
+    Numbers are rounded, so that the same evidence in another order is the same to the last bit.
+    """
+    certain = np.clip(score, 0.05, 0.99)[:, None]
+    likelihood = np.log(certain * names[:, category].T + (1 - certain) / max(names.shape[1], 1))
+    return np.asarray(np.rint(likelihood * WHOLE).astype(np.int64).sum(axis=0) / WHOLE, np.float64)
+
+
+def named_as_one(things: Sequence[Named], classes: int) -> FloatArray:
+    """Shares ``[classes, classes]``, the same both ways, of the names of a class that stand beside those of another.
+
+    A thing that was called one twice and another three times is two names that are mistakes, whichever it is. Each
+    name counts as much as its score.
+    """
+    number, both = np.zeros(classes, np.int64), np.zeros((classes, classes), np.int64)
+    for category, score in things:
+        name, place = np.unique(category, return_inverse=True)
+        times = np.zeros(len(name), np.int64)
+        np.add.at(times, place, np.rint(score * WHOLE).astype(np.int64))
+        number[name] += times
+        if len(name) > 1:
+            both[np.ix_(name, name)] += np.minimum(times[:, None], times[None, :])
+    np.fill_diagonal(both, 0)
+    return np.asarray(both / (np.maximum(number[:, None], number[None, :]) + SEVERAL * WHOLE), np.float64)
+
+
+def settled(
+    things: Sequence[Named],
+    fits: FloatArray,
+    confusion: FloatArray | None = None,
+    barred: BoolArray | None = None,
+) -> FloatArray:
+    """Probabilities ``[things, classes]`` of what the things of a map are, of all that they were called.
+
+    `fits` ``[things, classes]``: logarithms of how well each fits a class otherwise (`sizes`); NaN, where nobody knows,
+    counts as the least of the others. That, and how many things of a class there are, weighs between the names of a
+    thing and what these are taken for; no other class gains by it. `barred` ``[things, classes]``: what each cannot be,
+    unless it has no other name.
+    """
+    classes = fits.shape[1]
+    if not things:
+        return np.zeros((0, classes))
+    shares = named_as_one(things, classes)
+    if confusion is not None:
+        shares = np.maximum(shares, np.minimum(confusion, confusion.T))
+    names = name_probabilities(classes, shares)
+    known = (np.maximum(names, names.T) > 2 * float(names.min())) | np.eye(classes, dtype=np.bool_)
+    called = np.array([of_names(category, score, names) for category, score in things]).reshape(fits.shape)
+    may = np.array([known[category].any(axis=0) for category, _ in things]).reshape(fits.shape)
+    if barred is not None:
+        barred = (
+            barred
+            & ~np.array([row[category].all() for row, (category, _) in zip(barred, things, strict=True)])[:, None]
+        )
+        may &= ~barred
+    least = np.where(may & ~np.isnan(fits), fits, np.inf).min(axis=1, keepdims=True)
+    fits = np.where(np.isnan(fits), np.where(np.isinf(least), 0.0, least), fits)
+    count = np.zeros(classes)
+    for _ in range(ROUNDS):
+        weight = fits + np.log(count + FEW)
+        weight = np.where(may, weight, np.where(may, weight, np.inf).min(axis=1, keepdims=True))
+        total = called + weight if barred is None else np.where(barred, -np.inf, called + weight)
+        found = np.exp(total - total.max(axis=1, keepdims=True))
+        found /= found.sum(axis=1, keepdims=True)
+        count = np.rint(found * WHOLE).astype(np.int64).sum(axis=0) / WHOLE
+    return np.asarray(found, np.float64)
 
 
 def support(keyframe: Int64Array, category: Int64Array, score: FloatArray) -> dict[int, float]:

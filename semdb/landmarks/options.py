@@ -154,3 +154,7 @@ class LandmarkOptions:
     confirmed_share: float = 0.2
     gone: int = 2
     one_place: float = 0.3
+
+    def least(self, keyframes: int, missed: int) -> float:
+        """How many keyframes have to show a thing that so many show and missed."""
+        return max(self.confirmed, self.confirmed_share * (keyframes + missed))

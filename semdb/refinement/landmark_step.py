@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 CLOCK_NS = 10**17  # times from here on (1973) are of the clock on the wall; smaller ones begin with their recording
 LEAST_EVIDENCE = 0.0005
-REVISION = 7  # of the computation: another one makes what is stored out of date
+REVISION = 8  # of the computation: another one makes what is stored out of date
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,9 +68,9 @@ class LandmarkStep:
     ) -> LandmarkSet:
         from semdb.landmarks.build import SeenKeyframe, find_landmarks
         from semdb.landmarks.lift import SeenObject, lift_keyframe
-        from semdb.landmarks.longest import longest_of
         from semdb.landmarks.memo import name_of
         from semdb.landmarks.remembered_lift import GRID, LIFT, lift_arrays, lifted_from
+        from semdb.landmarks.sizes import sizes_of
         from semdb.threads import cores, each
 
         gravity = landmark_rows.load_gravity(store.engine, map_id)
@@ -154,7 +154,7 @@ class LandmarkStep:
         classes = sorted(numbers, key=lambda name: numbers[name])
         wide = np.zeros((len(classes), len(classes)))
         wide[: len(names), : len(names)] = confusion
-        found_all = find_landmarks(seen, len(classes), wide, up, self.options, show, parts, longest_of(classes))
+        found_all = find_landmarks(seen, len(classes), wide, up, self.options, show, parts, sizes_of(classes))
         stored = _stored(found_all, rows, classes, list(recordings), parts, told=told)
         parts.save()
         return stored

@@ -12,6 +12,7 @@ from semdb.landmarks.build import SeenKeyframe, find_landmarks
 from semdb.landmarks.gravity import estimate_gravity
 from semdb.landmarks.lift import Grids, LiftedKeyframe, SeenObject, lift_keyframe
 from semdb.landmarks.register import corrected_poses
+from semdb.landmarks.sizes import unknown_sizes
 from semdb.landmarks.values import Landmarks, LandmarkState
 from semdb.recordings.synthetic import SyntheticOptions, SyntheticSequence
 from semdb.types import FloatArray
@@ -163,8 +164,9 @@ def without_objects(lifted: LiftedKeyframe) -> LiftedKeyframe:
 
 def test_weak_sightings_confirm_by_their_sum_and_no_thing_larger_than_its_class(room: Room, found: Landmarks) -> None:
     def again(score: float, longest: float) -> dict[tuple[int, int], LandmarkState]:
+        sizes = replace(unknown_sizes(len(room.names)), longest=np.full(len(room.names), longest))
         frames = [replace(frame, score=np.full(len(frame.score), score)) for frame in room.keyframes(room.poses)]
-        things = find_landmarks(frames, len(room.names), longest=np.full(len(room.names), longest)).landmarks
+        things = find_landmarks(frames, len(room.names), sizes=sizes).landmarks
         return {thing.key: thing.state for thing in things}
 
     confirmed = {thing.key: thing for thing in found.landmarks if thing.state is LandmarkState.CONFIRMED}

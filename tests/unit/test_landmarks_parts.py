@@ -11,10 +11,10 @@ from semdb.geometry import so3_exp
 from semdb.geometry.sensor import depth_noise
 from semdb.landmarks.boxes import Box, intersection_over_union, shared_area, upright_axes, upright_box
 from semdb.landmarks.clustering import clusters, contract
-from semdb.landmarks.evidence import fuse, name_probabilities, support
+from semdb.landmarks.evidence import fuse, name_probabilities, settled, support
 from semdb.landmarks.kernels import joined_pixels
 from semdb.landmarks.lift import SeenObject, apart, lift_keyframe, measured_noise, same_masks
-from semdb.landmarks.longest import longest_of
+from semdb.landmarks.sizes import sizes_of
 from semdb.landmarks.visits import witness
 from semdb.types import Camera
 
@@ -97,15 +97,17 @@ def test_a_rare_name_of_another_class_does_not_win() -> None:
 
 
 def test_what_is_too_large_for_a_class_is_of_another_one() -> None:
-    names, barred = name_probabilities(3), np.array([True, False, False])
-    phones, score = np.array([0, 0, 0, 1]), np.full(4, 0.6)
-    assert fuse(phones, score, names).argmax() == 0
-    found = fuse(phones, score, names, barred)
+    phones, barred = (np.array([0, 0, 0, 1]), np.full(4, 0.6)), np.array([[True, False, False]])
+    nothing = np.full((1, 3), np.nan)
+    assert settled([phones], nothing).argmax() == 0
+    found = settled([phones], nothing, barred=barred)
     assert found.argmax() == 1
-    assert found[0] == 0
-    alone = fuse(phones[:3], score[:3], names, barred)  # no other name: it keeps that one, and is not confirmed
-    assert alone.tolist() == fuse(phones[:3], score[:3], names).tolist()
-    assert longest_of(["cell phone", "chair", "of my own"]).tolist() == [0.3, np.inf, np.inf]
+    assert found[0, 0] == 0
+    alone = (phones[0][:3], phones[1][:3])  # no other name: it keeps that one, and is not confirmed
+    assert settled([alone], nothing, barred=barred).tolist() == settled([alone], nothing).tolist()
+    sizes = sizes_of(["cell phone", "chair", "of my own"])
+    assert sizes.longest.tolist() == [0.3, np.inf, np.inf]
+    assert sizes.too_large(np.array([[0.1, 0.4, 0.2], [0.1, 0.3, 0.2]])).tolist() == [[True, False, False], [False] * 3]
 
 
 def test_support_is_the_highest_score_of_each_keyframe() -> None:
