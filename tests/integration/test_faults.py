@@ -192,7 +192,7 @@ def test_the_broker_is_killed_and_comes_back_empty(
 def test_the_disk_of_the_database_is_full(long_room: Path, some: Store, server_kind: servers.Kind) -> None:
     space = "--innodb-data-file-path=ibdata1:12M:autoextend:max:{}M"
     how = ("--innodb-file-per-table=0",)
-    with servers.server(server_kind, *how, space.format(16), install_options=(*how, space.format(16))) as server:
+    with servers.server(server_kind, *how, space.format(18), install_options=(*how, space.format(18))) as server:
         make_schema(server.url())
         with open_store(server.url()) as store:
             fill = IngestOptions(stride=1, map_name="full")
