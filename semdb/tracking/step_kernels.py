@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from semdb.compiled import kernel
+from semdb.localization.bundle_kernels import move_images
 
 CAUCHY_SQUARED = 4.0  # (2 sigma)^2, as in the adjustment of pairs
 FARTHEST = 0.2  # m and rad: a step of the solution beyond is none
@@ -67,8 +68,7 @@ def solve_step(
     Gauss and Newton's steps, at most `rounds`, until one is less than `still` (m, rad). `prior` ``[3]`` is the
     information on the turn, of which `expected` is known. False where the equations have no solution nearby.
     """
-    moved = np.empty((3, 4))
-    rotation, translation, turned = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
+    rotation, translation = np.empty((3, 3)), np.empty(3)
     for _ in range(rounds):
         for i in range(3):
             translation[i] = pose[i, 3]
@@ -84,23 +84,8 @@ def solve_step(
             if not abs(change[i]) < FARTHEST:
                 return False
             most = max(most, abs(change[i]))
-        x, y, z = change[3], change[4], change[5]
-        square = x * x + y * y + z * z
-        angle = np.sqrt(square)
-        sine = np.sin(angle) / angle if angle > 1e-8 else 1.0
-        half = (1.0 - np.cos(angle)) / square if angle > 1e-4 else 0.5 - square / 24
-        turned[0, 0], turned[1, 1] = 1 - half * (y * y + z * z), 1 - half * (x * x + z * z)
-        turned[2, 2] = 1 - half * (x * x + y * y)
-        turned[0, 1], turned[1, 0] = half * x * y - sine * z, half * x * y + sine * z
-        turned[0, 2], turned[2, 0] = half * x * z + sine * y, half * x * z - sine * y
-        turned[1, 2], turned[2, 1] = half * y * z - sine * x, half * y * z + sine * x
+        pose[:] = move_images(pose.reshape(1, 4, 4), change.reshape(1, UNKNOWNS))[0]
         for i in range(3):
-            for j in range(4):
-                moved[i, j] = turned[i, 0] * pose[0, j] + turned[i, 1] * pose[1, j] + turned[i, 2] * pose[2, j]
-        for i in range(3):
-            for j in range(4):
-                pose[i, j] = moved[i, j]
-            pose[i, 3] += change[i]
             turn[i] += change[6 + i]
         if most < still:
             break
